@@ -1,0 +1,113 @@
+"""Rollouts of the shipped experts: what a demonstration is, before it is written anywhere (paper, Sec. IV-C)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+
+from dynmap_rl.envs import DynmapBatchedEnv, scene_seed
+from dynmap_rl.envs.world import EPISODE_STEPS
+from dynmap_rl.experts import list_checkpoints, load_expert
+
+
+KEYS = [
+    "pixels",
+    "agent_pos",
+    "goal",
+    "dynamics",
+    "action",
+    *(("next", k) for k in ("reward", "done", "is_success", "dropped", "position_error")),
+]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How one episode is made.
+
+    Attributes:
+        scene_seed: draws the scene.
+        checkpoint: the expert's checkpoint.
+        noise: standard deviation of the noise on the expert's acceleration, in units of its own exploration.
+        detours: goals other than the scene's that the expert is sent to first.
+    """
+
+    scene_seed: int
+    checkpoint: str
+    noise: float = 0.0
+    detours: int = 0
+
+
+def plan_demonstrations(task: str, split: str, start: int, count: int) -> list[Plan]:
+    """Candidates ``start .. start + count`` of a split: checkpoints in turn, every other one with noise."""
+    checkpoints = list_checkpoints(task)
+    return [
+        Plan(scene_seed(split, i), checkpoints[i % len(checkpoints)], noise=(i // len(checkpoints)) % 2 * 1.0)
+        for i in range(start, start + count)
+    ]
+
+
+def plan_exploration(task: str, split: str, start: int, count: int) -> list[Plan]:
+    """Episodes that are no demonstrations: noisy experts that are sent to other places than the goal."""
+    checkpoints = list_checkpoints(task)
+    return [
+        Plan(scene_seed(split, i), checkpoints[i % len(checkpoints)], noise=(0.5, 1.0, 2.0)[i % 3], detours=3)
+        for i in range(start, start + count)
+    ]
+
+
+def roll_out(task: str, plans: list[Plan]) -> TensorDict:
+    """Run the plans as one batch.
+
+    Returns:
+        A TensorDict ``[E, 120]``: ``pixels``, ``agent_pos``, ``goal``, ``dynamics``, ``action`` as executed, and
+        under ``next`` ``reward``, ``done``, ``is_success``, ``dropped``, ``position_error``.
+    """
+    n = len(plans)
+    env = DynmapBatchedEnv(task, n, from_pixels=True)
+    td = env.reset(TensorDict({"scene_seed": torch.tensor([p.scene_seed for p in plans])}, [n]))
+    networks = {name: load_expert(task, name) for name in sorted({p.checkpoint for p in plans})}
+    rngs = [np.random.default_rng([p.scene_seed, 1]) for p in plans]
+    detours = _detour_goals(plans, rngs)
+    steps = []
+    for t in range(EPISODE_STEPS):
+        state = td["state"].clone()
+        goal = detours[:, t]  # [E, 2], NaN where the scene's own goal holds
+        apart = 2 * (goal - td["dynamics", "position"][:, :2])
+        state[:, :2] = torch.where(goal.isnan(), state[:, :2], apart)
+        acceleration = _expert_acceleration(state, plans, networks, rngs)
+        action = np.stack([_to_action(w, a) for w, a in zip(env.worlds, acceleration, strict=True)])
+        td = env.step(td.set("action", torch.from_numpy(action)))
+        executed = np.stack([w.action for w in env.worlds]).astype(np.float32)
+        td["action"] = torch.from_numpy(executed)
+        steps.append(td.select(*KEYS))
+        td = td["next"]
+    return torch.stack(steps, 1)
+
+
+def _expert_acceleration(state, plans, networks, rngs) -> np.ndarray:
+    out = np.empty((len(plans), 3))
+    for name, network in networks.items():
+        rows = [i for i, p in enumerate(plans) if p.checkpoint == name]
+        mean, std = network(state[rows])
+        for row, m, s in zip(rows, mean.numpy(), std.numpy(), strict=True):
+            out[row] = m + plans[row].noise * s * rngs[row].standard_normal(3)
+    return out
+
+
+def _to_action(world, acceleration: np.ndarray) -> np.ndarray:
+    return world.action_for(acceleration).astype(np.float32)
+
+
+def _detour_goals(plans: list[Plan], rngs) -> torch.Tensor:
+    """``[E, 120, 2]`` goals of the detours (m), each for 20 to 40 steps from the start; NaN afterwards."""
+    goals = np.full((len(plans), EPISODE_STEPS, 2), np.nan, dtype=np.float32)
+    for row, (plan, rng) in enumerate(zip(plans, rngs, strict=True)):
+        t = 0
+        for _ in range(plan.detours):
+            end = t + int(rng.integers(20, 41))
+            goals[row, t:end] = rng.uniform((0.15, 0.08), (0.85, 0.75))
+            t = end
+    return torch.from_numpy(goals)

@@ -1,0 +1,41 @@
+"""What a frozen world model makes of episodes, computed once: the input of decoupled policy training (Sec. III-B)."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from dynmap_rl.modules import WorldModel
+
+from .augmentation import augment
+
+
+@torch.no_grad()
+def compute_features(
+    world_model: WorldModel,
+    episodes: TensorDictBase,
+    copies: int = 0,
+    generator: torch.Generator | None = None,
+    batch: int = 10,
+) -> TensorDict:
+    """Latents and hidden states of whole episodes, with the actions and goals that go with them.
+
+    Args:
+        world_model: frozen.
+        episodes: ``[E, T]`` with ``pixels``, ``action``, ``goal``, ``dynamics``.
+        copies: so many augmented versions of every episode follow the plain ones.
+        generator: of the augmentations.
+
+    Returns:
+        ``[(1 + copies) E, T]`` with ``latent``, ``hidden1``, ``hidden2``, ``action``, ``goal``.
+    """
+    parts = []
+    for copy in range(copies + 1):
+        for chunk in episodes.select("pixels", "action", "goal", "dynamics").split(batch):
+            if copy:
+                chunk = augment(chunk, generator)
+            latent = world_model.encode(chunk["pixels"])
+            _, hidden1, hidden2 = world_model.predict(latent, chunk["action"])
+            features = {"latent": latent, "hidden1": hidden1, "hidden2": hidden2}
+            parts.append(TensorDict(features, chunk.shape).update(chunk.select("action", "goal")))
+    return torch.cat(parts)

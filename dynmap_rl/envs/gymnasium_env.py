@@ -1,0 +1,148 @@
+"""The tasks as Gymnasium environments."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from .renderer import Renderer
+from .scene import SceneRanges
+from .tasks import get_task
+from .world import ACCELERATION_LIMIT, CONTROL_DT, EPISODE_STEPS, VELOCITY_LIMIT
+
+ACTION_LIMITS = {"position": VELOCITY_LIMIT * CONTROL_DT, "acceleration": ACCELERATION_LIMIT}
+OBS_TYPES = ("state", "pixels", "pixels_agent_pos")
+
+
+class DynmapEnv(gym.Env):
+    """A cart carries a free-standing block over a 1 m x 1 m scene, controlled at 20 Hz.
+
+    Description:
+        The block stands on the cart, held by nothing but friction. It tips when the cart accelerates faster than
+        about ``9.81 * block_width / block_height`` (2.9 to 4.9 m/s^2 here). Every episode has its own sizes,
+        positions and colours. An episode lasts 120 steps (6 s).
+
+    Action:
+        ``control="position"``: float32 ``(3,)``, the change dX, dY, dTheta of the commanded cart pose in one step,
+        at most 20 mm, 20 mm, 50 mrad (0.4 m/s, 1 rad/s). ``control="acceleration"``: float32 ``(3,)``, the cart's
+        acceleration, at most 3 m/s^2, 3 m/s^2, 10 rad/s^2. Both go through the same limits of speed, acceleration
+        and room to brake before the edge of the workspace.
+
+    Observation:
+        ``state``: float32 ``(16,)``, privileged, for experts (see ``BalanceReaching.state``).
+        ``pixels``: uint8 ``(64, 64, 3)``.
+        ``pixels_agent_pos``: a dict of ``pixels`` and ``agent_pos``, float32 ``(5,)``: commanded cart pose x, y,
+        theta and goal x, y (m, m, rad, m, m).
+
+    Reward:
+        The task's, about 0 to 1 a step.
+
+    Success, drop, position error:
+        ``info`` holds ``is_success`` (set on the last step only), ``dropped`` and ``position_error`` (m, the mean
+        goal distance of the last 10 steps), as numpy scalars. Task 1: success if never dropped and the position
+        error at the end is under 50 mm. Dropped: the block leans over by more than 45 degrees relative to the cart,
+        its centre is below half its standing height, or it is beyond the cart's edge.
+
+    Starting state:
+        Drawn from ``ranges`` by the seed; block upright and at rest on a level, resting cart.
+
+    Termination, truncation:
+        Terminated when the block is dropped, truncated after 120 steps.
+
+    Args:
+        task: name of the task.
+        obs_type: ``state``, ``pixels`` or ``pixels_agent_pos``.
+        control: ``position`` or ``acceleration``.
+        ranges: what scenes are drawn from.
+        render_mode: ``rgb_array`` or None.
+        render_size: side of what ``render()`` returns, in pixels.
+
+    Reset arguments:
+        ``reset(options={"cart_x": 0.3, "block_color": (0, 0, 90), ...})`` fixes any factor of the scene.
+
+    Version history:
+        v0: first release.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": int(1 / CONTROL_DT)}
+
+    def __init__(
+        self,
+        task: str = "balance_reaching",
+        obs_type: str = "state",
+        control: str = "position",
+        ranges: SceneRanges | None = None,
+        render_mode: str | None = None,
+        render_size: int = 256,
+    ):
+        if obs_type not in OBS_TYPES:
+            raise ValueError(f"unknown obs_type {obs_type!r}; choose from {OBS_TYPES}")
+        if control not in ACTION_LIMITS:
+            raise ValueError(f"unknown control {control!r}; choose from {sorted(ACTION_LIMITS)}")
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"unknown render_mode {render_mode!r}; choose rgb_array or None")
+        self.task = get_task(task)
+        self.task_description = self.task.description
+        self.obs_type = obs_type
+        self.control = control
+        self.ranges = ranges or SceneRanges()
+        self.render_mode = render_mode
+        self._render_size = render_size
+        self._max_episode_steps = EPISODE_STEPS
+        self._frames = Renderer(64) if obs_type != "state" else None
+        self._large: Renderer | None = None
+        limit = ACTION_LIMITS[control].astype(np.float32)
+        self.action_space = spaces.Box(-limit, limit, dtype=np.float32)
+        self.observation_space = self._observation_space()
+
+    def _observation_space(self) -> spaces.Space:
+        pixels = spaces.Box(0, 255, (64, 64, 3), np.uint8)
+        agent_pos = spaces.Box(-2.0, 2.0, (5,), np.float32)
+        state = spaces.Box(-10.0, 10.0, (self.task.state_size,), np.float32)
+        both = spaces.Dict({"pixels": pixels, "agent_pos": agent_pos})
+        return {"state": state, "pixels": pixels, "pixels_agent_pos": both}[self.obs_type]
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+        super().reset(seed=seed)
+        scene = self.task.sample_scene(self.np_random, self.ranges)
+        self.world = self.task.make_world(scene.replace(**(options or {})))
+        return self._observe(), self._info()
+
+    def step(self, action: np.ndarray):
+        if self.control == "position":
+            self.world.step(action)
+        else:
+            self.world.accelerate(action)
+        world = self.world
+        truncated = world.steps >= EPISODE_STEPS
+        return self._observe(), self.task.reward(world), world.dropped, truncated, self._info()
+
+    def render(self) -> np.ndarray | None:
+        """uint8 ``[render_size, render_size, 3]``."""
+        if self.render_mode is None:
+            return None
+        self._large = self._large or Renderer(self._render_size)
+        return self._large.draw(self.world, self.task).copy()
+
+    def _observe(self):
+        if self.obs_type == "state":
+            return self.task.state(self.world)
+        pixels = self._frames.draw(self.world, self.task).copy()
+        if self.obs_type == "pixels":
+            return pixels
+        return {"pixels": pixels, "agent_pos": agent_pos(self.world)}
+
+    def _info(self) -> dict[str, np.generic]:
+        return {
+            "is_success": np.bool_(self.task.is_success(self.world)),
+            "dropped": np.bool_(self.world.dropped),
+            "position_error": np.float32(self.world.position_error),
+        }
+
+
+def agent_pos(world) -> np.ndarray:
+    """What a policy may know beside the frame, float32 ``[5]``: commanded cart pose and goal."""
+    return np.concatenate([world.commanded, world.goal]).astype(np.float32)

@@ -1,0 +1,62 @@
+"""Draws a world with pygame. The only place that knows pixels: 1 m x 1 m on ``size`` x ``size`` of them."""
+
+from __future__ import annotations
+
+import math
+import os
+import warnings
+
+import numpy as np
+
+os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")  # pygame imports the deprecated pkg_resources
+    import pygame
+
+from .tasks import BalanceReaching, Polygon
+from .world import World
+
+
+class Renderer:
+    """Draws on a bare surface: no window, no audio, no display needed.
+
+    Args:
+        size: side of the frame in pixels.
+        supersample: draw so many times larger and average; 1 gives hard edges, as in the paper.
+    """
+
+    def __init__(self, size: int = 64, supersample: int = 1):
+        self.size = size
+        self.scale = size * supersample
+        self.canvas = pygame.Surface((self.scale, self.scale), depth=32)
+        self.frame = pygame.Surface((size, size), depth=32) if supersample > 1 else self.canvas
+
+    def draw(self, world: World, task: BalanceReaching) -> np.ndarray:
+        """The frame, uint8 ``[size, size, 3]`` (height, width, RGB); the array is read-only."""
+        scene = world.scene
+        self.canvas.fill(scene.background_color)
+        for polygon, color in task.markers(scene):
+            self._fill(polygon, color)
+        cx, cy, ct, bx, by, bt = world.position.tolist()
+        self._fill(box(cx, cy, ct, scene.cart_width, scene.cart_height), scene.cart_color)
+        self._fill(box(bx, by, bt, scene.block_width, scene.block_height), scene.block_color)
+        if self.frame is not self.canvas:
+            pygame.transform.smoothscale(self.canvas, (self.size, self.size), self.frame)
+        pixels = pygame.image.tobytes(self.frame, "RGB")
+        return np.frombuffer(pixels, dtype=np.uint8).reshape(self.size, self.size, 3)
+
+    def _fill(self, polygon: Polygon, color: tuple[int, int, int]) -> None:
+        scale = self.scale  # pygame truncates to the pixel that a corner lies in
+        pygame.draw.polygon(self.canvas, color, [(x * scale, (1.0 - y) * scale) for x, y in polygon])
+
+
+def box(x: float, y: float, angle: float, width: float, height: float) -> Polygon:
+    """The corners of a rotated rectangle about its centre (m)."""
+    c, s = math.cos(angle) / 2, math.sin(angle) / 2
+    wx, wy, hx, hy = c * width, s * width, -s * height, c * height
+    return [
+        (x - wx - hx, y - wy - hy),
+        (x + wx - hx, y + wy - hy),
+        (x + wx + hx, y + wy + hy),
+        (x - wx + hx, y - wy + hy),
+    ]

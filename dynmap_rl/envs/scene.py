@@ -1,0 +1,129 @@
+"""What varies from episode to episode: the scene, the ranges it is drawn from, and the seeds (paper, Sec. IV-B)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
+
+import numpy as np
+
+Range = tuple[float, float]
+Color = tuple[int, int, int]
+
+GOAL_COLOR: Color = (0, 200, 0)
+SPLITS = {"train": 0, "eval": 1, "validation": 2, "test": 3, "exploration": 4}
+SEEDS_PER_SPLIT = 100_000_000
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One episode's start: sizes and positions in m, colours in 0..255, density in kg/m^2.
+
+    ``cart_x, cart_y`` is the cart's centre, ``block_shift`` the block's offset from it along the cart.
+    """
+
+    cart_width: float = 0.25
+    cart_height: float = 0.04
+    block_width: float = 0.06
+    block_height: float = 0.16
+    block_shift: float = 0.0
+    cart_x: float = 0.3
+    cart_y: float = 0.2
+    goal_x: float = 0.7
+    goal_y: float = 0.4
+    friction: float = 0.8
+    density: float = 100.0
+    cart_color: Color = (150, 40, 40)
+    block_color: Color = (40, 40, 150)
+    background_color: Color = (230, 230, 230)
+
+    def __post_init__(self):
+        for size in ("cart_width", "cart_height", "block_width", "block_height", "density"):
+            if not getattr(self, size) > 0:
+                raise ValueError(f"scene: {size} must be positive, got {getattr(self, size)}")
+        if 2 * abs(self.block_shift) > self.cart_width:
+            raise ValueError(f"scene: block_shift {self.block_shift} puts the block's centre beside the cart")
+
+    def to_dict(self) -> dict:
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: Mapping) -> Scene:
+        return cls().replace(**values)
+
+    def replace(self, **values) -> Scene:
+        """A copy with some factors fixed; unknown names raise ``ValueError``."""
+        unknown = set(values) - {f.name for f in fields(self)}
+        if unknown:
+            raise ValueError(
+                f"scene: unknown factor {sorted(unknown)}; known are {[f.name for f in fields(self)]}"
+            )
+        return replace(self, **{k: tuple(v) if k.endswith("color") else v for k, v in values.items()})
+
+
+@dataclass(frozen=True)
+class SceneRanges:
+    """The uniform ranges a scene is drawn from; narrow or widen any of them.
+
+    Start and goal are at least ``min_distance`` apart, so that no start is already solved. Objects are darker
+    than the background, and cart and block differ by ``min_contrast`` (Euclidean, 0..441), so that nothing
+    is invisible.
+    """
+
+    cart_width: Range = (0.20, 0.30)
+    cart_height: Range = (0.04, 0.04)
+    block_width: Range = (0.06, 0.06)
+    block_height: Range = (0.12, 0.20)
+    block_shift: Range = (-0.04, 0.04)
+    cart_x: Range = (0.18, 0.82)
+    cart_y: Range = (0.08, 0.68)
+    goal_x: Range = (0.18, 0.82)
+    goal_y: Range = (0.08, 0.68)
+    friction: Range = (0.8, 0.8)
+    density: Range = (100.0, 100.0)
+    object_color: Range = (0, 140)
+    background_color: Range = (180, 255)
+    min_distance: float = 0.2
+    min_contrast: float = 60.0
+
+
+def sample_scene(rng: np.random.Generator, ranges: SceneRanges | None = None) -> Scene:
+    """Draw a scene. The same generator state gives the same scene."""
+    r = ranges or SceneRanges()
+    for _ in range(1000):
+        factors = {
+            f.name: float(rng.uniform(*getattr(r, f.name)))
+            for f in fields(Scene)
+            if not f.name.endswith("color")
+        }
+        distance = np.hypot(factors["cart_x"] - factors["goal_x"], factors["cart_y"] - factors["goal_y"])
+        if distance >= r.min_distance:
+            break
+    else:
+        raise ValueError(f"scene: the ranges hold no start {r.min_distance} m from the goal; widen them")
+    return Scene(**factors, **_sample_colors(rng, r))
+
+
+def _sample_colors(rng: np.random.Generator, r: SceneRanges) -> dict[str, Color]:
+    def color(low, high):
+        return tuple(int(c) for c in rng.integers(int(low), int(high) + 1, 3))
+
+    background = color(*r.background_color)
+    for _ in range(1000):
+        cart, block = color(*r.object_color), color(*r.object_color)
+        if np.linalg.norm(np.subtract(cart, block)) >= r.min_contrast:
+            return {"cart_color": cart, "block_color": block, "background_color": background}
+    raise ValueError(f"scene: no two object colours differ by {r.min_contrast}; lower min_contrast")
+
+
+def scene_seed(split: str, index: int) -> int:
+    """The seed of scene ``index`` of a split. Splits never share a seed.
+
+    Raises:
+        ValueError: for an unknown split or an index outside it.
+    """
+    if split not in SPLITS:
+        raise ValueError(f"unknown split {split!r}; choose from {sorted(SPLITS)}")
+    if not 0 <= index < SEEDS_PER_SPLIT:
+        raise ValueError(f"scene index {index} is outside 0..{SEEDS_PER_SPLIT - 1}")
+    return SPLITS[split] * SEEDS_PER_SPLIT + index

@@ -1,0 +1,151 @@
+"""The tasks as one batched TorchRL environment: many worlds, one process, no wrapper around each."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from .gymnasium_env import ACTION_LIMITS, agent_pos
+from .renderer import Renderer
+from .scene import SceneRanges
+from .tasks import get_task
+from .world import EPISODE_STEPS, World
+
+
+class DynmapBatchedEnv(EnvBase):
+    """``num_envs`` worlds of a task as a TorchRL environment of batch size ``[num_envs]``.
+
+    The same seeds and actions give the same trajectories as the Gymnasium ids, with any ``num_envs``.
+
+    Observation keys: ``state`` ``[N, S]`` (privileged), ``agent_pos`` ``[N, 5]``, ``goal`` ``[N, 2]``,
+    ``("dynamics", "position" | "velocity" | "acceleration")`` ``[N, 6]`` (SI units), ``dropped``, ``is_success``
+    ``[N, 1]``, ``position_error`` ``[N, 1]`` (m), and ``pixels`` uint8 ``[N, 3, 64, 64]`` with ``from_pixels``.
+
+    A reset draws each world's scene from the environment's seed, or, where the reset TensorDict has an entry
+    ``scene_seed`` ``[N]`` (int64), from that: ``env.reset(TensorDict(scene_seed=torch.arange(n), batch_size=[n]))``.
+
+    Args:
+        task: name of the task.
+        num_envs: number of worlds N.
+        from_pixels: draw a frame a step.
+        control: ``position`` or ``acceleration`` (see ``DynmapEnv``).
+        ranges: what scenes are drawn from.
+        supersample: of the renderer.
+        seed: of the scenes.
+    """
+
+    batch_locked = True
+
+    def __init__(
+        self,
+        task: str = "balance_reaching",
+        num_envs: int = 1,
+        from_pixels: bool = False,
+        control: str = "position",
+        ranges: SceneRanges | None = None,
+        supersample: int = 1,
+        seed: int | None = None,
+        device: torch.device | str = "cpu",
+    ):
+        if num_envs < 1:
+            raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+        if control not in ACTION_LIMITS:
+            raise ValueError(f"unknown control {control!r}; choose from {sorted(ACTION_LIMITS)}")
+        super().__init__(device=device, batch_size=[num_envs])
+        self.task = get_task(task)
+        self.control = control
+        self.ranges = ranges or SceneRanges()
+        self.renderer = Renderer(supersample=supersample) if from_pixels else None
+        self.worlds: list[World | None] = [None] * num_envs
+        self._make_specs()
+        self.set_seed(seed)
+
+    def _make_specs(self) -> None:
+        n, device = self.batch_size[0], self.device
+
+        def unbounded(*shape, dtype=torch.float32):
+            return Unbounded((n, *shape), dtype=dtype, device=device)
+
+        dynamics = {name: unbounded(6) for name in ("position", "velocity", "acceleration")}
+        observation = {
+            "state": unbounded(self.task.state_size),
+            "agent_pos": unbounded(5),
+            "goal": unbounded(len(self.task.goal(self.task.make_world(_any_scene(self))))),
+            "dynamics": Composite(dynamics, shape=(n,), device=device),
+            "position_error": unbounded(1),
+            "dropped": Binary(1, (n, 1), dtype=torch.bool, device=device),
+            "is_success": Binary(1, (n, 1), dtype=torch.bool, device=device),
+        }
+        if self.renderer:
+            observation["pixels"] = Bounded(0, 255, (n, 3, 64, 64), dtype=torch.uint8, device=device)
+        self.observation_spec = Composite(observation, shape=(n,), device=device)
+        limit = torch.as_tensor(ACTION_LIMITS[self.control], dtype=torch.float32).expand(n, 3)
+        self.action_spec = Bounded(-limit, limit, (n, 3), dtype=torch.float32, device=device)
+        self.reward_spec = unbounded(1)
+        flags = {
+            k: Binary(1, (n, 1), dtype=torch.bool, device=device) for k in ("done", "terminated", "truncated")
+        }
+        self.done_spec = Composite(flags, shape=(n,), device=device)
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.rng = np.random.default_rng(seed)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
+        n = self.batch_size[0]
+        mask = torch.ones(n, dtype=torch.bool)
+        seeds = None
+        if tensordict is not None:
+            if (flags := tensordict.get("_reset", None)) is not None:
+                mask = flags.reshape(n).cpu()
+            seeds = tensordict.get("scene_seed", None)
+        for i in mask.nonzero().flatten().tolist():
+            seed = int(seeds[i]) if seeds is not None else int(self.rng.integers(2**63))
+            scene = self.task.sample_scene(np.random.default_rng(seed), self.ranges)
+            self.worlds[i] = self.task.make_world(scene)
+        return self._observe().update(self._flags())
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        actions = tensordict["action"].cpu().numpy()
+        for world, action in zip(self.worlds, actions, strict=True):
+            if self.control == "position":
+                world.step(action)
+            else:
+                world.accelerate(action)
+        reward = np.array([self.task.reward(world) for world in self.worlds], dtype=np.float32)
+        return self._observe().update(self._flags()).set("reward", self._tensor(reward[:, None]))
+
+    def _observe(self) -> TensorDict:
+        worlds, task = self.worlds, self.task
+        names = ("position", "velocity", "acceleration")
+        data = {
+            "state": self._tensor(np.stack([task.state(w) for w in worlds])),
+            "agent_pos": self._tensor(np.stack([agent_pos(w) for w in worlds])),
+            "goal": self._tensor(np.stack([task.goal(w) for w in worlds])),
+            "dynamics": {k: self._tensor(np.stack([getattr(w, k) for w in worlds])) for k in names},
+            "position_error": self._tensor(np.array([[w.position_error] for w in worlds])),
+            "is_success": torch.tensor([[task.is_success(w)] for w in worlds], device=self.device),
+        }
+        if self.renderer:
+            frames = np.stack([self.renderer.draw(w, task) for w in worlds])
+            data["pixels"] = torch.from_numpy(frames).permute(0, 3, 1, 2).to(self.device)
+        return TensorDict(data, batch_size=self.batch_size, device=self.device)
+
+    def _flags(self) -> dict[str, torch.Tensor]:
+        dropped = torch.tensor([[w.dropped] for w in self.worlds], device=self.device)
+        truncated = torch.tensor([[w.steps >= EPISODE_STEPS] for w in self.worlds], device=self.device)
+        return {
+            "dropped": dropped,
+            "terminated": dropped.clone(),
+            "truncated": truncated,
+            "done": dropped | truncated,
+        }
+
+    def _tensor(self, array: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(array.astype(np.float32, copy=False)).to(self.device)
+
+
+def _any_scene(env: DynmapBatchedEnv):
+    return env.task.sample_scene(np.random.default_rng(0), env.ranges)

@@ -1,0 +1,185 @@
+"""The simulated world: a position-controlled cart that carries a free-standing block (paper, Sec. IV).
+
+Plain Python and PyMunk. SI units: m, s, rad, kg. Gravity points along -y.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pymunk
+
+from .scene import Scene
+
+GRAVITY = 9.81  # m/s^2
+CONTROL_DT = 0.05  # s, 20 Hz
+SUBSTEPS = 50  # of 1 ms each
+EPISODE_STEPS = 120
+FINAL_STEPS = 10  # the position error is a mean over the last 10 steps
+
+# The limits of the cart, for experts and students alike, per axis (x, y, theta).
+VELOCITY_LIMIT = np.array([0.4, 0.4, 1.0])  # m/s, m/s, rad/s
+ACCELERATION_LIMIT = np.array([3.0, 3.0, 10.0])  # m/s^2, m/s^2, rad/s^2
+WORKSPACE_LOW = np.array([0.05, 0.03, -math.pi / 3])  # m, m, rad
+WORKSPACE_HIGH = np.array([0.95, 0.95, math.pi / 3])
+ACTION_LIMIT = VELOCITY_LIMIT * CONTROL_DT  # the largest change of the commanded pose in one control step
+
+GROUND = -0.25  # m, where a dropped block comes to lie, below the picture
+DROP_TILT = math.pi / 4  # rad, relative to the cart
+
+
+class World:
+    """Cart and block of one scene.
+
+    Arrays hold cart x, y, theta, block x, y, theta, in this order, ``[6]`` float64:
+
+    Attributes:
+        position, velocity: read from PyMunk.
+        acceleration: ``(velocity_t - velocity_{t-1}) / CONTROL_DT``, zero at the start.
+        commanded: ``[3]`` commanded cart pose, the start pose plus the sum of all actions.
+        action: ``[3]`` the last action as executed, after the limits.
+        goal: ``[2]`` where the cart shall go.
+        steps: control steps so far.
+        dropped: the block is, or once was, no longer carried: it leaned over by more than 45 degrees relative
+            to the cart, its centre sank below half its standing height over the cart's top, or it moved beyond
+            the cart's edge.
+        errors: distance of cart and goal after every control step, the start first (m).
+    """
+
+    def __init__(self, scene: Scene):
+        self.scene = scene
+        self.goal = np.array([scene.goal_x, scene.goal_y])
+        self.space = pymunk.Space()
+        self.space.gravity = (0.0, -GRAVITY)
+        self.space.collision_slop = 1e-4  # Chipmunk's default assumes pixels
+        self._add_ground()
+        self._add_cart(scene)
+        self._add_block(scene)
+        self.commanded = np.array([scene.cart_x, scene.cart_y, 0.0])
+        self.action = np.zeros(3)
+        self.position = self._read_position()
+        self.velocity = np.zeros(6)
+        self.acceleration = np.zeros(6)
+        self.steps = 0
+        self.dropped = False
+        self.errors = [self.goal_distance]
+
+    def _add_ground(self) -> None:
+        thickness = 0.5
+        ends = (-100.0, GROUND - thickness), (100.0, GROUND - thickness)
+        shape = pymunk.Segment(self.space.static_body, *ends, radius=thickness)
+        shape.friction = 1.0
+        self.space.add(shape)
+
+    def _add_cart(self, s: Scene) -> None:
+        self.cart = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
+        self.cart.position = (s.cart_x, s.cart_y)
+        shape = pymunk.Poly.create_box(self.cart, (s.cart_width, s.cart_height))
+        shape.friction = 1.0  # Chipmunk multiplies the two frictions
+        self.space.add(self.cart, shape)
+
+    def _add_block(self, s: Scene) -> None:
+        size = (s.block_width, s.block_height)
+        mass = s.density * s.block_width * s.block_height
+        self.block = pymunk.Body(mass, pymunk.moment_for_box(mass, size))
+        self.block.position = (s.cart_x + s.block_shift, s.cart_y + (s.cart_height + s.block_height) / 2)
+        shape = pymunk.Poly.create_box(self.block, size)
+        shape.friction = s.friction
+        self.space.add(self.block, shape)
+
+    def step(self, action: np.ndarray) -> None:
+        """One control step of 50 ms with the position-update action ``(dX, dY, dTheta)`` (m, m, rad).
+
+        The change of the commanded pose becomes a constant acceleration by the second difference of commanded
+        positions, ``(a_t - a_{t-1}) / CONTROL_DT**2``, within the limits (paper, Sec. IV-A).
+        """
+        action = self._limit(np.asarray(action, dtype=np.float64))
+        action = action.astype(np.float32).astype(np.float64)  # as stored, so that a replay is bit-exact
+        before = self.action / CONTROL_DT
+        after = action / CONTROL_DT
+        self._simulate(before, after)
+        self.action = action
+        self.commanded = self.commanded + action
+        velocity = self._read_velocity()
+        self.acceleration = (velocity - self.velocity) / CONTROL_DT
+        self.velocity = velocity
+        self.position = self._read_position()
+        self.steps += 1
+        self.dropped = self.dropped or self._is_dropped()
+        self.errors.append(self.goal_distance)
+
+    def accelerate(self, acceleration: np.ndarray) -> None:
+        """One control step at a constant cart acceleration (m/s^2, m/s^2, rad/s^2), the expert's interface."""
+        self.step(self.action_for(acceleration))
+
+    def action_for(self, acceleration: np.ndarray) -> np.ndarray:
+        """The position-update action that gives this cart acceleration from the present state."""
+        return self.action + np.asarray(acceleration, dtype=np.float64) * CONTROL_DT**2
+
+    def _limit(self, action: np.ndarray) -> np.ndarray:
+        """The action that the cart can execute: limits of acceleration, of speed, and room left to brake."""
+        if action.shape != (3,) or not np.isfinite(action).all():
+            raise ValueError(f"an action is 3 finite numbers (dX, dY, dTheta), got {action}")
+        room_low = np.maximum(self.commanded - WORKSPACE_LOW, 0.0)
+        room_high = np.maximum(WORKSPACE_HIGH - self.commanded, 0.0)
+        low = -np.minimum(VELOCITY_LIMIT, _braking_speed(room_low)) * CONTROL_DT
+        high = np.minimum(VELOCITY_LIMIT, _braking_speed(room_high)) * CONTROL_DT
+        change = ACCELERATION_LIMIT * CONTROL_DT**2
+        return np.clip(np.clip(action, low, high), self.action - change, self.action + change)
+
+    def _simulate(self, before: np.ndarray, after: np.ndarray) -> None:
+        """50 steps of 1 ms while the cart's velocity goes linearly from ``before`` to ``after``."""
+        cart, step = self.cart, self.space.step
+        dt = CONTROL_DT / SUBSTEPS
+        # The velocity in the middle of each substep: the cart's path is then the exact parabola.
+        velocities = before + (after - before) * MIDPOINTS
+        for x, y, angular in velocities.tolist():
+            cart.velocity = (x, y)
+            cart.angular_velocity = angular
+            step(dt)
+        x, y, angular = after.tolist()
+        cart.velocity = (x, y)
+        cart.angular_velocity = angular
+
+    def _read_position(self) -> np.ndarray:
+        (cx, cy), (bx, by) = self.cart.position, self.block.position
+        return np.array([cx, cy, self.cart.angle, bx, by, self.block.angle])
+
+    def _read_velocity(self) -> np.ndarray:
+        (cx, cy), (bx, by) = self.cart.velocity, self.block.velocity
+        return np.array([cx, cy, self.cart.angular_velocity, bx, by, self.block.angular_velocity])
+
+    @property
+    def block_in_cart(self) -> tuple[float, float, float]:
+        """The block's pose in the cart's frame: x, y (m) from the cart's centre, and angle (rad)."""
+        cx, cy, ct, bx, by, bt = self.position.tolist()
+        c, s = math.cos(ct), math.sin(ct)
+        dx, dy = bx - cx, by - cy
+        return c * dx + s * dy, c * dy - s * dx, bt - ct
+
+    def _is_dropped(self) -> bool:
+        x, y, tilt = self.block_in_cart
+        s = self.scene
+        standing = s.cart_height / 2 + s.block_height / 4
+        return abs(tilt) > DROP_TILT or y < standing or abs(x) > s.cart_width / 2
+
+    @property
+    def goal_distance(self) -> float:
+        """Distance of the cart's centre and the goal (m)."""
+        return math.dist(self.position[:2], self.goal)
+
+    @property
+    def position_error(self) -> float:
+        """Mean distance of cart and goal over the last 10 steps (m), PE in the paper."""
+        last = self.errors[1:][-FINAL_STEPS:] or self.errors
+        return sum(last) / len(last)
+
+
+MIDPOINTS = ((np.arange(SUBSTEPS) + 0.5) / SUBSTEPS)[:, None]
+
+
+def _braking_speed(room: np.ndarray) -> np.ndarray:
+    """The speed from which the cart still stops within ``room``, braking at the limit in whole control steps."""
+    brake = ACCELERATION_LIMIT * CONTROL_DT
+    return np.sqrt(brake**2 / 4 + 2 * ACCELERATION_LIMIT * room) - brake / 2

@@ -1,0 +1,94 @@
+"""Figures of a run: reconstruction, dynamics prediction (paper, Fig. 6), rollouts as an animation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+from PIL import Image
+from tensordict import TensorDictBase
+
+from dynmap_rl.modules import WorldModel, make_world_model_module
+
+COMPONENTS = ("x", "y", "theta")
+UNITS = {
+    "position": ("m", "m", "rad"),
+    "velocity": ("m/s", "m/s", "rad/s"),
+    "acceleration": ("m/s$^2$", "m/s$^2$", "rad/s$^2$"),
+}
+
+
+@torch.no_grad()
+def predict(world_model: WorldModel, episodes: TensorDictBase) -> TensorDictBase:
+    """The episodes ``[E, T]`` with the world model's one-step predictions."""
+    return make_world_model_module(world_model)(episodes.select("pixels", "action", "dynamics").clone(False))
+
+
+def plot_reconstruction(
+    world_model: WorldModel, episodes: TensorDictBase, path: Path, steps=(1, 8, 16, 24, 60, 110)
+) -> None:
+    """Held-out frames and their reconstructions from the frame before: one pair of rows an episode."""
+    steps = [t for t in steps if t < episodes.shape[1]]
+    out = predict(world_model, episodes)
+    figure, axes = plt.subplots(2 * len(out), len(steps), figsize=(1.3 * len(steps), 2.7 * len(out)))
+    for row, episode in enumerate(out):
+        truth = episode["pixels"].permute(0, 2, 3, 1).numpy()
+        guess = episode["reconstruction", "pixels"].clamp(0, 1).permute(0, 2, 3, 1).float().numpy()
+        for column, t in enumerate(steps):
+            axes[2 * row, column].imshow(truth[t])
+            axes[2 * row + 1, column].imshow(guess[t])
+            axes[0, column].set_title(f"t = {t}", fontsize=9)
+        axes[2 * row, 0].set_ylabel("true", fontsize=9)
+        axes[2 * row + 1, 0].set_ylabel("predicted", fontsize=9)
+    for axis in axes.flat:
+        axis.set(xticks=[], yticks=[])
+    _save(figure, path)
+
+
+def plot_dynamics(world_model: WorldModel, episode: TensorDictBase, path: Path) -> None:
+    """The block's true and predicted dynamics along one held-out episode ``[T]``; nothing for an Only-RGB model."""
+    if not world_model.supervision:
+        return
+    out = predict(world_model, episode[None])[0]
+    rows = len(world_model.supervision)
+    figure, axes = plt.subplots(rows, 3, figsize=(9, 2.2 * rows), squeeze=False, sharex=True)
+    time = np.arange(out.shape[0]) * 0.05
+    for row, quantity in enumerate(world_model.supervision):
+        for column, component in enumerate(COMPONENTS):
+            axis, index = axes[row, column], 3 + column
+            axis.plot(time, out["dynamics", quantity][:, index], "k", lw=1, label="true")
+            predicted = out["predicted_dynamics", quantity][1:, index]
+            axis.plot(time[1:], predicted, "tab:green", lw=1, label="predicted")
+            axis.set_title(f"block {quantity} {component} [{UNITS[quantity][column]}]", fontsize=8)
+            axis.tick_params(labelsize=7)
+    for axis in axes[-1]:
+        axis.set_xlabel("time [s]", fontsize=8)
+    axes[0, 0].legend(fontsize=7)
+    _save(figure, path)
+
+
+def save_gif(episodes: TensorDictBase, path: Path, columns: int = 4, scale: int = 3) -> None:
+    """Frames ``pixels`` ``[E, T, 3, 64, 64]`` of E episodes as one animation in real time."""
+    frames = episodes["pixels"].permute(1, 0, 3, 4, 2).numpy()  # (T, E, 64, 64, 3)
+    rows = -(-frames.shape[1] // columns)
+    blank = np.full((frames.shape[0], rows * columns - frames.shape[1], 64, 64, 3), 255, np.uint8)
+    grid = np.concatenate([frames, blank], 1).reshape(len(frames), rows, columns, 64, 64, 3)
+    grid = grid.swapaxes(2, 3).reshape(len(frames), rows * 64, columns * 64, 3)
+    images = [
+        Image.fromarray(f).resize((columns * 64 * scale, rows * 64 * scale), Image.Resampling.NEAREST)
+        for f in grid
+    ]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    images[0].save(path, save_all=True, append_images=images[1:], duration=50, loop=0, optimize=True)
+
+
+def _save(figure, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)

@@ -1,0 +1,69 @@
+"""Closed-loop evaluation: all episodes as one batch (paper, Sec. V-B)."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import step_mdp
+
+from dynmap_rl.envs import DynmapBatchedEnv, scene_seed
+from dynmap_rl.envs.world import EPISODE_STEPS
+from dynmap_rl.modules import Actor
+
+# Test scenes are never used for training, nor for choosing anything.
+TEST_EPISODES = 1000
+PAPER_EPISODES = 50
+
+
+def scene_seeds(split: str, count: int, start: int = 0) -> list[int]:
+    """The seeds of scenes ``start .. start + count`` of a split."""
+    return [scene_seed(split, start + i) for i in range(count)]
+
+
+@torch.no_grad()
+def roll_out(actor: Actor, task: str, seeds: list[int], keep_pixels: bool = False) -> TensorDict:
+    """Run one episode of 120 steps for each scene seed, to the end also where the block is dropped.
+
+    Returns:
+        A TensorDict ``[E, 120]`` with the environment's entries at t (``dynamics``, ``action``, ``goal``, ...;
+        ``pixels`` only where kept) and ``("next", "position_error" | "dropped" | "is_success")``; with a world model
+        that decodes dynamics, also ``("predicted_dynamics", quantity)`` at t, its one-step prediction along
+        these rollouts (zeros at t = 0).
+    """
+    actor = actor.eval()
+    env = DynmapBatchedEnv(task, len(seeds), from_pixels=True)
+    td = env.reset(TensorDict({"scene_seed": torch.tensor(seeds)}, [len(seeds)]))
+    keys = ["action", "goal", "dynamics", *(("next", k) for k in ("position_error", "dropped", "is_success"))]
+    keys += ["pixels"] if keep_pixels else []
+    steps = []
+    predicted = {q: torch.zeros(len(seeds), 6) for q in actor.world_model.supervision}
+    for _ in range(EPISODE_STEPS):
+        td = env.step(actor(td))
+        step = td.select(*keys)
+        step["predicted_dynamics"] = TensorDict(predicted, [len(seeds)])
+        steps.append(step)
+        td = step_mdp(td, keep_other=False)
+        states = td["predicted_latent"], td["hidden1"], td["hidden2"]
+        predicted = actor.world_model.decode_dynamics(*states)
+    return torch.stack(steps, 1)
+
+
+def episode_rows(episodes: TensorDict, seeds: list[int]) -> list[dict]:
+    """One JSON-ready row an episode: scene seed, dropped, position error (m), success, and, where the world model
+    decodes positions, the mean distance between predicted and true cart position (m)."""
+    last = episodes["next"][:, -1]
+    rows = [
+        {
+            "scene_seed": seed,
+            "dropped": bool(last["dropped"][i]),
+            "position_error": round(last["position_error"][i].item(), 5),
+            "success": bool(last["is_success"][i]),
+        }
+        for i, seed in enumerate(seeds)
+    ]
+    if "position" in episodes["predicted_dynamics"].keys():
+        error = episodes["predicted_dynamics", "position"] - episodes["dynamics", "position"]
+        error = error[:, 1:, :2].norm(dim=-1).mean(1)
+        for row, value in zip(rows, error.tolist(), strict=True):
+            row["localization_error"] = round(value, 5)
+    return rows

@@ -1,0 +1,66 @@
+"""Drop rate, position error and success rate, with their uncertainty."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import binomtest, bootstrap
+
+
+def summarize(rows: list[dict]) -> dict[str, float]:
+    """DR and SR in %, PE in mm (paper, Sec. V-B), over any number of episode rows, with 95 % Wilson intervals."""
+    count = len(rows)
+    dropped = sum(row["dropped"] for row in rows)
+    success = sum(row["success"] for row in rows)
+    summary = {
+        "episodes": count,
+        "DR": 100 * dropped / count,
+        "DR_interval": wilson(dropped, count),
+        "PE": 1000 * float(np.mean([row["position_error"] for row in rows])),
+        "SR": 100 * success / count,
+        "SR_interval": wilson(success, count),
+    }
+    if "localization_error" in rows[0]:
+        summary["localization"] = 1000 * float(np.mean([row["localization_error"] for row in rows]))
+    return summary
+
+
+def summarize_seeds(rows_by_seed: list[list[dict]]) -> dict[str, tuple[float, float]]:
+    """The paper's protocol: mean and standard deviation over policy seeds of DR (%), PE (mm) and SR (%)."""
+    summaries = [summarize(rows) for rows in rows_by_seed]
+    return {
+        key: (float(np.mean([s[key] for s in summaries])), float(np.std([s[key] for s in summaries])))
+        for key in ("DR", "PE", "SR")
+    }
+
+
+def wilson(successes: int, count: int) -> tuple[float, float]:
+    """95 % Wilson interval of a rate, in %."""
+    interval = binomtest(successes, count).proportion_ci(0.95, method="wilson")
+    return 100 * interval.low, 100 * interval.high
+
+
+def success_gap(rows_a: list[list[dict]], rows_b: list[list[dict]]) -> dict:
+    """SR of a less SR of b, in points, on start states that both share.
+
+    Args:
+        rows_a, rows_b: per policy seed, the rows of the same scenes in the same order.
+
+    Returns:
+        ``gap`` and its 95 % bootstrap interval over the start states, after averaging over policy seeds.
+
+    Raises:
+        ValueError: the two were not evaluated on the same scenes.
+    """
+    scenes = [[row["scene_seed"] for row in rows] for rows in (*rows_a, *rows_b)]
+    if any(s != scenes[0] for s in scenes):
+        raise ValueError("the two results are not on the same start states; evaluate both again")
+
+    def rate(rows):
+        return np.mean([[row["success"] for row in seed] for seed in rows], axis=0)
+
+    difference = 100 * (rate(rows_a) - rate(rows_b))
+    gap = float(difference.mean())
+    if np.ptp(difference) == 0:
+        return {"gap": gap, "interval": (gap, gap)}
+    interval = bootstrap((difference,), np.mean, rng=np.random.default_rng(0)).confidence_interval
+    return {"gap": gap, "interval": (float(interval.low), float(interval.high))}

@@ -1,0 +1,90 @@
+"""World models and policies as folders: ``weights.safetensors`` and ``arguments.json``, complete by themselves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from dynmap_rl.runs import load_weights, read_json, save_weights, write_json
+
+from .normalization import Normalizer
+from .policy import FeedforwardPolicy, RecurrentPolicy
+from .world_model import WorldModel
+
+POLICIES = {"feedforward": FeedforwardPolicy, "recurrent": RecurrentPolicy}
+
+
+def make_world_model(
+    constants: dict, supervision: tuple[str, ...], latent_size=64, hidden_size=128, keypoints=True
+) -> WorldModel:
+    """A fresh world model with a dataset's normalisation constants (``{name: {"low": [D], "high": [D]}}``)."""
+    dynamics = {q: Normalizer(**constants[q]) for q in supervision}
+    return WorldModel(Normalizer(**constants["action"]), dynamics, latent_size, hidden_size, keypoints)
+
+
+def make_policy(constants: dict, kind: str, world_model: WorldModel, width: int, dropout: float = 0.0):
+    """A fresh policy of a kind, ``feedforward`` or ``recurrent``."""
+    if kind not in POLICIES:
+        raise ValueError(f"unknown policy {kind!r}; choose from {sorted(POLICIES)}")
+    sizes = world_model.latent_size, world_model.hidden_size
+    action, goal = Normalizer(**constants["action"]), Normalizer(**constants["goal"])
+    return POLICIES[kind](*sizes, action, goal, width, dropout)
+
+
+def save_world_model(folder: Path, model: WorldModel) -> None:
+    arguments = {
+        "action": model.transition.action.size,
+        "dynamics": {q: n.size for q, n in model.dynamics_decoder.normalizers.items()},
+        "latent_size": model.latent_size,
+        "hidden_size": model.hidden_size,
+        "keypoints": model.keypoints,
+    }
+    write_json(Path(folder) / "arguments.json", arguments)
+    save_weights(Path(folder) / "weights.safetensors", model)
+
+
+def load_world_model(folder: Path) -> WorldModel:
+    """Raises ``ValueError`` where the folder holds no world model."""
+    arguments = _read_arguments(folder)
+    arguments["action"] = _blank(arguments["action"])
+    arguments["dynamics"] = {q: _blank(size) for q, size in arguments["dynamics"].items()}
+    model = WorldModel(**arguments)
+    load_weights(Path(folder) / "weights.safetensors", model)
+    return model.eval()
+
+
+def save_policy(folder: Path, policy: FeedforwardPolicy | RecurrentPolicy, world_model: WorldModel) -> None:
+    recurrent = isinstance(policy, RecurrentPolicy)
+    arguments = {
+        "kind": "recurrent" if recurrent else "feedforward",
+        "latent_size": world_model.latent_size,
+        "hidden_size": world_model.hidden_size,
+        "action": policy.action.size,
+        "goal": policy.goal.size,
+        "width": policy.width,
+    }
+    write_json(Path(folder) / "arguments.json", arguments)
+    save_weights(Path(folder) / "weights.safetensors", policy)
+
+
+def load_policy(folder: Path) -> FeedforwardPolicy | RecurrentPolicy:
+    """Raises ``ValueError`` where the folder holds no policy."""
+    arguments = _read_arguments(folder)
+    kind = POLICIES[arguments.pop("kind")]
+    arguments |= {"action": _blank(arguments["action"]), "goal": _blank(arguments["goal"])}
+    policy = kind(**arguments)
+    load_weights(Path(folder) / "weights.safetensors", policy)
+    return policy.eval()
+
+
+def _read_arguments(folder: Path) -> dict:
+    path = Path(folder) / "arguments.json"
+    if not path.exists():
+        raise ValueError(f"{folder} holds no checkpoint (no arguments.json); train one first")
+    return read_json(path)
+
+
+def _blank(size: int) -> Normalizer:
+    """A normaliser whose constants the weights will overwrite."""
+    return Normalizer(-torch.ones(size), torch.ones(size))

@@ -1,0 +1,77 @@
+"""Predicted latents and hidden states to frames and dynamics (paper, Sec. III-A)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import nn
+
+from .layers import up
+from .normalization import Normalizer
+
+DYNAMICS = ("position", "velocity", "acceleration")
+
+
+class ImageDecoder(nn.Module):
+    """``(z_hat_t, h1_t, h2_t)`` to a frame ``[..., 3, 64, 64]`` in 0..1.
+
+    Args:
+        input_size: Z + 2 H.
+        channels: of the maps of stride 8, 4 and 2.
+    """
+
+    def __init__(self, input_size: int, channels: tuple[int, int, int] = (64, 32, 16)):
+        super().__init__()
+        c1, c2, c3 = channels
+        self.expand = nn.Linear(input_size, c1 * 64)
+        self.layers = nn.Sequential(
+            nn.Unflatten(1, (c1, 8, 8)),
+            nn.ReLU(),
+            up(c1, c2),
+            up(c2, c3),
+            nn.ConvTranspose2d(c3, 3, 4, 2, 1),
+        )
+
+    def forward(
+        self, predicted_latent: torch.Tensor, hidden1: torch.Tensor, hidden2: torch.Tensor
+    ) -> torch.Tensor:
+        x = torch.cat([predicted_latent, hidden1, hidden2], -1)
+        batch = x.shape[:-1]
+        x = self.expand(x.reshape(-1, x.shape[-1]))
+        return (self.layers(x) + 0.5).unflatten(0, batch)
+
+
+class DynamicsDecoder(nn.Module):
+    """``(z_hat_t, h1_t, h2_t)`` to dynamics: a shared two-layer MLP and one head a quantity.
+
+    Args:
+        input_size: Z + 2 H.
+        normalizers: one for each decoded quantity, any of position, velocity, acceleration, or none.
+        width: of the MLP.
+
+    Raises:
+        ValueError: for an unknown quantity.
+    """
+
+    def __init__(self, input_size: int, normalizers: Mapping[str, Normalizer], width: int = 256):
+        super().__init__()
+        unknown = set(normalizers) - set(DYNAMICS)
+        if unknown:
+            raise ValueError(f"unknown dynamics {sorted(unknown)}; choose from {DYNAMICS}")
+        self.quantities = tuple(q for q in DYNAMICS if q in normalizers)
+        self.normalizers = nn.ModuleDict({q: normalizers[q] for q in self.quantities})
+        if self.quantities:
+            self.shared = nn.Sequential(
+                nn.Linear(input_size, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU()
+            )
+        self.heads = nn.ModuleDict({q: nn.Linear(width, normalizers[q].size) for q in self.quantities})
+
+    def forward(
+        self, predicted_latent: torch.Tensor, hidden1: torch.Tensor, hidden2: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
+        """``[..., D]`` in SI units for each of ``quantities``, in their order."""
+        if not self.quantities:
+            return ()
+        x = self.shared(torch.cat([predicted_latent, hidden1, hidden2], -1))
+        return tuple(self.normalizers[q].denormalize(self.heads[q](x).float()) for q in self.quantities)

@@ -1,0 +1,68 @@
+"""Frames to latents: ``z_t = ENC(I_t)`` (paper, Sec. III-A)."""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+from torch.nn import functional as F
+
+from .layers import down, same
+
+
+class Encoder(nn.Module):
+    """A plain CNN: uint8 or float frames ``[..., 3, 64, 64]`` in 0..255 to a latent ``[..., Z]``.
+
+    Strided convolutions down to 8 x 8. With ``keypoints`` a spatial softmax reads the
+    expected position of every channel of the 8 x 8 and 16 x 16 maps (Levine et al. 2016) and stands beside the
+    flattened map, so that the position of an object reaches the latent to a fraction of a pixel.
+
+    Args:
+        latent_size: Z.
+        channels: of the convolutions of stride 2, 4 and 8.
+        keypoints: read out expected positions too.
+    """
+
+    def __init__(
+        self, latent_size: int = 64, channels: tuple[int, int, int] = (16, 32, 64), keypoints: bool = True
+    ):
+        super().__init__()
+        c1, c2, c3 = channels
+        self.stem = nn.Sequential(down(3, c1), down(c1, c2))
+        self.top = nn.Sequential(down(c2, c3), same(c3))
+        self.keypoints = nn.ModuleList()
+        features = c3 * 64
+        if keypoints:
+            self.keypoints.extend([SpatialSoftmax(c2, 32), SpatialSoftmax(c3, 32)])
+            self.squeeze = nn.Conv2d(c3, 8, 1)
+            features = 8 * 64 + 2 * 2 * 32
+        self.project = nn.Linear(features, latent_size)
+
+    def forward(self, pixels: torch.Tensor) -> torch.Tensor:
+        if pixels.shape[-3:] != (3, 64, 64):
+            raise ValueError(f"pixels must be [..., 3, 64, 64], got {list(pixels.shape)}")
+        x = pixels.flatten(0, -4) if pixels.ndim > 4 else pixels.reshape(-1, 3, 64, 64)
+        x = x.to(self.project.weight.dtype).div(255.0).sub(0.5).contiguous(memory_format=torch.channels_last)
+        x = self.stem(x)  # (N, C, 16, 16)
+        y = self.top(x)  # (N, C, 8, 8)
+        if self.keypoints:
+            points = [read(m) for read, m in zip(self.keypoints, (x, y), strict=True)]
+            features = torch.cat([self.squeeze(y).flatten(1), *points], -1)
+        else:
+            features = y.flatten(1)
+        return self.project(features).unflatten(0, pixels.shape[:-3])  # (..., Z)
+
+
+class SpatialSoftmax(nn.Module):
+    """Maps ``[N, C, H, W]`` to ``points`` expected positions ``[N, 2 points]`` in [-1, 1]."""
+
+    def __init__(self, channels: int, points: int):
+        super().__init__()
+        self.logits = nn.Conv2d(channels, points, 1)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        logits = self.logits(x).float()
+        heat = F.softmax(logits.flatten(2), -1).unflatten(-1, logits.shape[2:])
+        across = torch.linspace(-1, 1, heat.shape[-1], device=heat.device)
+        down = torch.linspace(-1, 1, heat.shape[-2], device=heat.device)
+        return torch.cat([heat.sum(-2) @ across, heat.sum(-1) @ down], -1)
+

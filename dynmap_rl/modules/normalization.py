@@ -1,0 +1,32 @@
+"""Constants between SI units and the networks' [-1, 1], saved with the weights."""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+
+
+class Normalizer(nn.Module):
+    """Maps ``[low, high]`` to ``[-1, 1]``, linearly and without clipping.
+
+    Args:
+        low, high: ``[D]`` in SI units, ``low < high``.
+    """
+
+    def __init__(self, low: torch.Tensor, high: torch.Tensor):
+        super().__init__()
+        low, high = torch.as_tensor(low, dtype=torch.float32), torch.as_tensor(high, dtype=torch.float32)
+        if low.shape != high.shape or not bool((low < high).all()):
+            raise ValueError(f"low must be below high, got {low.tolist()} and {high.tolist()}")
+        self.register_buffer("center", (low + high) / 2)
+        self.register_buffer("scale", (high - low) / 2)
+
+    @property
+    def size(self) -> int:
+        return self.center.numel()
+
+    def normalize(self, x: torch.Tensor) -> torch.Tensor:
+        return (x - self.center) / self.scale
+
+    def denormalize(self, x: torch.Tensor) -> torch.Tensor:
+        return x * self.scale + self.center

@@ -1,0 +1,101 @@
+"""Goal-conditioned policies on the world model's states (paper, Eq. 1 and 2)."""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+
+from .normalization import Normalizer
+from .recurrent import State, TwoLSTM
+
+
+class FeedforwardPolicy(nn.Module):
+    """``a_t = pi(z_t, h_t, g)``: an MLP (paper, Eq. 1).
+
+    Args:
+        latent_size, hidden_size: Z and H of the world model.
+        action, goal: normalisers; their sizes are A and G.
+        width: of the hidden layers.
+        dropout: on the input features, during training.
+    """
+
+    def __init__(
+        self,
+        latent_size: int,
+        hidden_size: int,
+        action: Normalizer,
+        goal: Normalizer,
+        width: int = 256,
+        dropout: float = 0.0,
+    ):
+        super().__init__()
+        self.action, self.goal, self.width = action, goal, width
+        self.dropout = nn.Dropout(dropout)
+        self.layers = nn.Sequential(
+            nn.Linear(latent_size + 2 * hidden_size + goal.size, width),
+            nn.SiLU(),
+            nn.Linear(width, width),
+            nn.SiLU(),
+            nn.Linear(width, action.size),
+        )
+
+    def forward(self, latent, hidden1, hidden2, goal) -> torch.Tensor:
+        """``[..., Z]``, ``[..., H]`` twice and the goal ``[..., G]`` (SI units) to the action ``[..., A]`` (SI)."""
+        features = self.dropout(torch.cat([latent, hidden1, hidden2], -1))
+        return self.action.denormalize(self.layers(torch.cat([features, self.goal.normalize(goal)], -1)))
+
+    def step(self, latent, hidden1, hidden2, goal, state: State | None = None):
+        """The same for one time step; the state passes through, so that both policies are called alike."""
+        return self(latent, hidden1, hidden2, goal), state
+
+    def initial_state(self, batch: int, device=None) -> None:
+        return None
+
+
+class RecurrentPolicy(nn.Module):
+    """``a_t, h_pi_{t+1} = pi(z_t, g, h_t, h_pi_t)``: two more LSTM cells (paper, Eq. 2).
+
+    Args:
+        latent_size, hidden_size: Z and H of the world model.
+        action, goal: normalisers; their sizes are A and G.
+        width: hidden size of the policy's own cells.
+        dropout: on the input features, during training.
+    """
+
+    def __init__(
+        self,
+        latent_size: int,
+        hidden_size: int,
+        action: Normalizer,
+        goal: Normalizer,
+        width: int = 128,
+        dropout: float = 0.0,
+    ):
+        super().__init__()
+        self.action, self.goal, self.width = action, goal, width
+        self.dropout = nn.Dropout(dropout)
+        self.embed = nn.Sequential(nn.Linear(latent_size + 2 * hidden_size + goal.size, width), nn.SiLU())
+        self.lstm = TwoLSTM(width, width)
+        self.head = nn.Sequential(nn.Linear(2 * width, width), nn.SiLU(), nn.Linear(width, action.size))
+
+    def forward(self, latent, hidden1, hidden2, goal) -> torch.Tensor:
+        """Sequence form: ``[B, T, ...]`` each, to actions ``[B, T, A]`` (SI units), from ``h_pi_0 = 0``."""
+        x = self._embed(latent, hidden1, hidden2, goal)
+        _, top, _ = self.lstm(x)
+        return self._act(x, top)
+
+    def step(self, latent, hidden1, hidden2, goal, state: State) -> tuple[torch.Tensor, State]:
+        """Step form: ``[B, ...]`` each and ``h_pi_t`` to the action ``[B, A]`` and ``h_pi_{t+1}``."""
+        x = self._embed(latent, hidden1, hidden2, goal)
+        state = self.lstm.step(x, state)
+        return self._act(x, state[2]), state
+
+    def initial_state(self, batch: int, device=None) -> State:
+        return self.lstm.initial_state(batch, device)
+
+    def _embed(self, latent, hidden1, hidden2, goal) -> torch.Tensor:
+        features = self.dropout(torch.cat([latent, hidden1, hidden2], -1))
+        return self.embed(torch.cat([features, self.goal.normalize(goal)], -1))
+
+    def _act(self, x: torch.Tensor, top: torch.Tensor) -> torch.Tensor:
+        return self.action.denormalize(self.head(torch.cat([x, top], -1)))

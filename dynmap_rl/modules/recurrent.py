@@ -1,0 +1,53 @@
+"""Two LSTM layers in a row, in sequence form (training) and step form (control), with one set of weights."""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+
+State = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
+
+
+class TwoLSTM(nn.Module):
+    """Two LSTM layers that give the hidden state of both at every step.
+
+    The state is ``(hidden1, cell1, hidden2, cell2)``, each ``[B, H]``; None stands for zeros.
+
+    Args:
+        input_size: size of the input.
+        hidden_size: H.
+    """
+
+    def __init__(self, input_size: int, hidden_size: int):
+        super().__init__()
+        # Two modules, not num_layers=2: that would hide the first layer's states.
+        self.lstm1 = nn.LSTM(input_size, hidden_size, batch_first=True)
+        self.lstm2 = nn.LSTM(hidden_size, hidden_size, batch_first=True)
+        self.hidden_size = hidden_size
+
+    def forward(
+        self, x: torch.Tensor, state: State | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor, State]:
+        """``[B, T, input]`` to ``hidden1``, ``hidden2`` ``[B, T, H]`` after each step, and the last state."""
+        state1 = state2 = None
+        if state is not None:
+            h1, c1, h2, c2 = (s[None].contiguous() for s in state)
+            state1, state2 = (h1, c1), (h2, c2)
+        hidden1, (h1, c1) = self.lstm1(x, state1)
+        hidden2, (h2, c2) = self.lstm2(hidden1, state2)
+        return hidden1, hidden2, (h1[0], c1[0], h2[0], c2[0])
+
+    def step(self, x: torch.Tensor, state: State) -> State:
+        """One step: ``[B, input]`` and the state to the next state."""
+        return self(x[:, None], state)[2]
+
+    def initial_state(self, batch: int, device=None) -> State:
+        return tuple(torch.zeros(batch, self.hidden_size, device=device) for _ in range(4))
+
+
+def delay(x: torch.Tensor) -> torch.Tensor:
+    """Shift ``[B, T, ...]`` by one step: out[:, t] = x[:, t-1], and zeros at t = 0.
+
+    A recurrent part that reads step t writes what holds at t + 1. This puts it where it holds.
+    """
+    return torch.cat([torch.zeros_like(x[:, :1]), x[:, :-1]], 1)

@@ -1,0 +1,49 @@
+"""The transition model: ``(z_hat_{t+1}, h_{t+1}) = DYN(z_t, a_t, h_t)`` (paper, Sec. III-A)."""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+
+from .normalization import Normalizer
+from .recurrent import State, TwoLSTM, delay
+
+
+class Transition(nn.Module):
+    """Two LSTM layers over latent and action; the next latent is predicted as a change of this one.
+
+    Args:
+        action: normaliser of the actions; its size is A.
+        latent_size: Z.
+        hidden_size: H.
+    """
+
+    def __init__(self, action: Normalizer, latent_size: int = 64, hidden_size: int = 128):
+        super().__init__()
+        self.action = action
+        self.lstm = TwoLSTM(latent_size + action.size, hidden_size)
+        self.change = nn.Linear(hidden_size, latent_size)
+
+    def forward(
+        self, latent: torch.Tensor, action: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Sequence form, from ``h_0 = 0``.
+
+        Args:
+            latent: z, ``[B, T, Z]``.
+            action: ``[B, T, A]`` (SI units).
+
+        Returns:
+            ``predicted_latent`` ``[B, T, Z]`` and ``hidden1``, ``hidden2`` ``[B, T, H]``, all *at* time t: what is
+            predicted for t from everything before t. At t = 0 they are zeros: there is no prediction.
+        """
+        hidden1, hidden2, _ = self.lstm(torch.cat([latent, self.action.normalize(action)], -1))
+        predicted = latent + self.change(hidden2)
+        return delay(predicted), delay(hidden1), delay(hidden2)
+
+    def step(
+        self, latent: torch.Tensor, action: torch.Tensor, state: State
+    ) -> tuple[torch.Tensor, State]:
+        """Step form: ``z_t`` ``[B, Z]``, ``a_t`` ``[B, A]`` and ``h_t`` to ``z_hat_{t+1}`` and ``h_{t+1}``."""
+        state = self.lstm.step(torch.cat([latent, self.action.normalize(action)], -1), state)
+        return latent + self.change(state[2]), state

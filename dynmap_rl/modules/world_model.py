@@ -1,0 +1,72 @@
+"""The world model: encoder, transition and decoders, and its normalisation constants (paper, Sec. III-A)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import nn
+
+from .decoder import DynamicsDecoder, ImageDecoder
+from .encoder import Encoder
+from .normalization import Normalizer
+from .recurrent import State
+from .transition import Transition
+
+
+class WorldModel(nn.Module):
+    """Frames and actions to latents, hidden states, predicted frames and predicted dynamics.
+
+    Args:
+        action: normaliser of the actions.
+        dynamics: a normaliser for each supervised quantity: any of position, velocity, acceleration, or none.
+        latent_size, hidden_size: Z and H.
+        keypoints: of the encoder.
+    """
+
+    def __init__(
+        self,
+        action: Normalizer,
+        dynamics: Mapping[str, Normalizer],
+        latent_size: int = 64,
+        hidden_size: int = 128,
+        keypoints: bool = True,
+    ):
+        super().__init__()
+        self.latent_size, self.hidden_size, self.keypoints = latent_size, hidden_size, keypoints
+        self.encoder = Encoder(latent_size, keypoints=keypoints)
+        self.transition = Transition(action, latent_size, hidden_size)
+        self.image_decoder = ImageDecoder(latent_size + 2 * hidden_size)
+        self.dynamics_decoder = DynamicsDecoder(latent_size + 2 * hidden_size, dynamics)
+
+    @property
+    def supervision(self) -> tuple[str, ...]:
+        """The quantities that are decoded."""
+        return self.dynamics_decoder.quantities
+
+    def encode(self, pixels: torch.Tensor) -> torch.Tensor:
+        """``z_t = ENC(I_t)``: frames ``[..., 3, 64, 64]`` to latents ``[..., Z]``."""
+        return self.encoder(pixels)
+
+    def predict(
+        self, latent: torch.Tensor, action: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """``predicted_latent``, ``hidden1``, ``hidden2`` at every t of a sequence (:meth:`Transition.forward`)."""
+        return self.transition(latent, action)
+
+    def step(self, latent: torch.Tensor, action: torch.Tensor, state: State) -> tuple[torch.Tensor, State]:
+        """The same, one step at a time (:meth:`Transition.step`)."""
+        return self.transition.step(latent, action, state)
+
+    def initial_state(self, batch: int, device=None) -> State:
+        """``h_0 = 0``."""
+        return self.transition.lstm.initial_state(batch, device)
+
+    def decode_pixels(self, predicted_latent, hidden1, hidden2) -> torch.Tensor:
+        """Predicted frames ``[..., 3, 64, 64]`` in 0..1."""
+        return self.image_decoder(predicted_latent, hidden1, hidden2)
+
+    def decode_dynamics(self, predicted_latent, hidden1, hidden2) -> dict[str, torch.Tensor]:
+        """Predicted dynamics ``[..., D]`` by quantity (SI units)."""
+        values = self.dynamics_decoder(predicted_latent, hidden1, hidden2)
+        return dict(zip(self.supervision, values, strict=True))

@@ -1,0 +1,6 @@
+"""Losses."""
+
+from .imitation import imitation_loss
+from .world_model import WorldModelLoss
+
+__all__ = ["WorldModelLoss", "imitation_loss"]

@@ -1,0 +1,86 @@
+"""The world model's losses: RGB reconstruction, latent consistency, and dynamics (paper, Eq. 4a and 5)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
+from torchrl.objectives.common import LossModule
+
+from dynmap_rl.modules import WorldModel
+
+
+class WorldModelLoss(LossModule):
+    """The losses of Eq. 4a and 5 on windows of frames, actions and dynamics.
+
+    Every term is the mean over the time steps t >= 1 of a root mean square: the L2 norm of the paper's equations
+    (not its square), divided by the square root of the number of entries, so that frames, latents and dynamics are
+    of one scale and no constant has to weigh them.
+
+    Input: ``pixels`` uint8 ``[B, T, 3, 64, 64]``, ``action`` ``[B, T, A]`` and, for the model's supervision,
+    ``("dynamics", quantity)`` ``[B, T, D]``, in SI units.
+
+    Output: ``loss_rgb``, ``loss_latent`` (times ``beta_z``), ``loss_position``, ``loss_velocity``,
+    ``loss_acceleration`` (those supervised, times ``beta_dynamics``): scalars whose sum is to be minimised.
+
+    Args:
+        world_model: what is trained.
+        beta_z: weight of the latent loss.
+        beta_dynamics: weight of each dynamics loss; all quantities have the same.
+        stop_gradient: the latent loss moves the prediction only, not its target ``ENC(I_t)``.
+        rgb_steps: decode the frames of so many random steps of a window; None decodes all.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        pixels: NestedKey = "pixels"
+        action: NestedKey = "action"
+        dynamics: NestedKey = "dynamics"
+
+    default_keys = _AcceptedKeys
+
+    def __init__(
+        self,
+        world_model: WorldModel,
+        beta_z: float = 0.1,
+        beta_dynamics: float = 1.0,
+        stop_gradient: bool = True,
+        rgb_steps: int | None = None,
+    ):
+        super().__init__()
+        self.world_model = world_model
+        self.beta_z, self.beta_dynamics = beta_z, beta_dynamics
+        self.stop_gradient, self.rgb_steps = stop_gradient, rgb_steps
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        model, keys = self.world_model, self.tensor_keys
+        pixels = tensordict.get(keys.pixels)
+        latent = model.encode(pixels).float()  # (B, T, Z)
+        with torch.autocast(latent.device.type, enabled=False):
+            states = model.predict(latent, tensordict.get(keys.action))
+        predicted, hidden1, hidden2 = (x[:, 1:] for x in states)  # (B, T-1, .)
+        target = latent[:, 1:].detach() if self.stop_gradient else latent[:, 1:]
+        losses = {
+            "loss_rgb": self._rgb_loss(pixels[:, 1:], predicted, hidden1, hidden2),
+            "loss_latent": self.beta_z * rms(predicted - target).mean(),
+        }
+        for name, value in model.decode_dynamics(predicted, hidden1, hidden2).items():
+            scale = model.dynamics_decoder.normalizers[name].scale
+            truth = tensordict.get((keys.dynamics, name))[:, 1:]
+            losses[f"loss_{name}"] = self.beta_dynamics * rms((value - truth) / scale).mean()
+        return TensorDict(losses, [])
+
+    def _rgb_loss(self, pixels, *states) -> torch.Tensor:
+        steps = pixels.shape[1]
+        if self.rgb_steps is not None and self.rgb_steps < steps:
+            index = torch.randperm(steps, device=pixels.device)[: self.rgb_steps]
+            pixels, states = pixels[:, index], [s[:, index] for s in states]
+        frames = self.world_model.decode_pixels(*states).float()
+        return rms((frames - pixels.to(frames.dtype) / 255).flatten(-3)).mean()
+
+
+def rms(x: torch.Tensor) -> torch.Tensor:
+    """Root mean square over the last axis, smooth at zero."""
+    return (x.square().mean(-1) + 1e-8).sqrt()

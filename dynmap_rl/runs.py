@@ -1,0 +1,195 @@
+"""Run folders: settings, metrics and training state, written so that a kill at any moment loses nothing.
+
+A run folder holds ``config.json``, ``metrics.jsonl`` (one JSON object a line), ``checkpoint/`` and the results.
+The same command on the same folder resumes it. Torch is imported where it is used, so that ``--help`` is quick.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import math
+import os
+import random
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import torch
+
+
+def write_json(path: Path, value) -> None:
+    """Write ``value`` under a temporary name, then rename: the file is whole or absent."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary.write_text(json.dumps(value, indent=1) + "\n")
+    temporary.replace(path)
+
+
+def read_json(path: Path):
+    """Raises ``ValueError`` with the file's name where it is not valid JSON."""
+    try:
+        return json.loads(Path(path).read_text())
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path} is not valid JSON ({error}); delete it or restore it") from error
+
+
+def open_run(folder: Path, config, *, ignore: tuple[str, ...] = ()) -> Path:
+    """Create the folder, or reopen it where its settings are the same ones (but for ``ignore``).
+
+    Args:
+        config: a dataclass of settings.
+
+    Raises:
+        ValueError: the folder holds a run with other settings.
+    """
+    folder = Path(folder)
+    settings = json.loads(json.dumps(dataclasses.asdict(config), default=str))
+    path = folder / "config.json"
+    if path.exists():
+        stored = read_json(path)
+        changed = {
+            k: (stored.get(k), settings.get(k))
+            for k in {*stored, *settings} - set(ignore)
+            if stored.get(k) != settings.get(k)
+        }
+        if changed:
+            detail = ", ".join(f"{k}: {old} there, {new} here" for k, (old, new) in sorted(changed.items()))
+            raise ValueError(f"{folder} holds a run with other settings ({detail}); choose another --run")
+    else:
+        write_json(path, settings)
+    return folder
+
+
+def append_metrics(folder: Path, step: int, **metrics: float) -> None:
+    """Append one line to ``metrics.jsonl``."""
+    line = json.dumps({"step": step, **{k: _plain(v) for k, v in metrics.items()}})
+    with open(Path(folder) / "metrics.jsonl", "a") as file:
+        file.write(line + "\n")
+
+
+def read_metrics(folder: Path) -> list[dict]:
+    """The lines of ``metrics.jsonl``; a last line cut short by a kill is left out.
+
+    Raises:
+        ValueError: an earlier line is damaged.
+    """
+    path = Path(folder) / "metrics.jsonl"
+    if not path.exists():
+        return []
+    rows, lines = [], path.read_text().splitlines()
+    for number, line in enumerate(lines, start=1):
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError as error:
+            if number < len(lines):
+                raise ValueError(f"{path}, line {number} is not valid JSON ({error}); remove it") from error
+    return rows
+
+
+def truncate_metrics(folder: Path, step: int) -> None:
+    """Drop the lines after ``step``: what a killed run wrote beyond its last training state."""
+    rows = [row for row in read_metrics(folder) if row["step"] <= step]
+    path = Path(folder) / "metrics.jsonl"
+    temporary = path.with_name(".metrics.jsonl")
+    temporary.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    temporary.replace(path)
+
+
+def save_training_state(path: Path, **state) -> None:
+    """Save tensors and plain values, with the state of torch's generator, atomically."""
+    import torch
+
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    torch.save({**state, "rng": torch.get_rng_state()}, temporary)
+    temporary.replace(path)
+
+
+def load_training_state(path: Path) -> dict | None:
+    """What :func:`save_training_state` wrote, the generator restored; None where there is nothing yet.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
+    import torch
+
+    if not Path(path).exists():
+        return None
+    try:
+        state = torch.load(path, weights_only=True)
+        torch.set_rng_state(state.pop("rng"))
+    except Exception as error:
+        raise ValueError(f"{path} cannot be read ({error}); delete it to train from the start") from error
+    return state
+
+
+def save_weights(path: Path, module: torch.nn.Module) -> None:
+    """Write a module's state as safetensors, atomically."""
+    from safetensors.torch import save_file
+
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    save_file({k: v.detach().cpu().contiguous() for k, v in module.state_dict().items()}, temporary)
+    temporary.replace(path)
+
+
+def load_weights(path: Path, module: torch.nn.Module) -> None:
+    """Load safetensors into a module.
+
+    Raises:
+        ValueError: the file is missing, damaged, or does not fit the module.
+    """
+    from safetensors.torch import load_file
+
+    if not Path(path).exists():
+        raise ValueError(f"no weights at {path}")
+    try:
+        module.load_state_dict(load_file(path))
+    except Exception as error:
+        raise ValueError(f"{path} does not hold this model's weights: {error}") from error
+
+
+def seed_everything(seed: int) -> None:
+    """Seed Python, NumPy and torch."""
+    import torch
+
+    random.seed(seed)
+    np.random.seed(seed % 2**32)
+    torch.manual_seed(seed)
+
+
+def run_recipe(main, config_class) -> None:
+    """Parse the settings, run ``main(config)``, and turn an expected error into one line and exit code 2.
+
+    ``--debug`` (anywhere on the command line) shows the traceback instead.
+    """
+    import draccus
+
+    arguments = sys.argv[1:]
+    debug = "--debug" in arguments
+    arguments = [a for a in arguments if a != "--debug"]
+    try:
+        config = draccus.parse(config_class, args=arguments, exit_on_error=False)
+        main(config)
+    except KeyboardInterrupt:
+        sys.exit("stopped; the same command goes on where it was")
+    except (ValueError, OSError, argparse.ArgumentError, draccus.utils.DraccusException) as error:
+        if debug:
+            raise
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+def _plain(value):
+    """Tensors and arrays as plain numbers or lists."""
+    if not hasattr(value, "tolist"):
+        return value
+    return value.item() if math.prod(value.shape) == 1 else value.tolist()
