@@ -1,16 +1,22 @@
 """Closed-loop rollouts, DR / PE / SR, statistics and figures."""
 
-from .rollout import PAPER_EPISODES, TEST_EPISODES, episode_rows, roll_out, scene_seeds
+from .paper import TABLE_1, parse_supervision, row_name
+from .report import evaluate, print_row, write_report
+from .rollout import episode_rows, roll_out, scene_seeds
 from .statistics import success_gap, summarize, summarize_seeds, wilson
 
 __all__ = [
-    "PAPER_EPISODES",
-    "TEST_EPISODES",
+    "TABLE_1",
     "episode_rows",
+    "evaluate",
+    "parse_supervision",
+    "print_row",
     "roll_out",
+    "row_name",
     "scene_seeds",
     "success_gap",
     "summarize",
     "summarize_seeds",
     "wilson",
+    "write_report",
 ]

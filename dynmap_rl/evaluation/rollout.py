@@ -10,10 +10,6 @@ from dynmap_rl.envs import DynmapBatchedEnv, scene_seed
 from dynmap_rl.envs.world import EPISODE_STEPS
 from dynmap_rl.modules import Actor
 
-# Test scenes are never used for training, nor for choosing anything.
-TEST_EPISODES = 1000
-PAPER_EPISODES = 50
-
 
 def scene_seeds(split: str, count: int, start: int = 0) -> list[int]:
     """The seeds of scenes ``start .. start + count`` of a split."""

@@ -36,7 +36,7 @@ def summarize_seeds(rows_by_seed: list[list[dict]]) -> dict[str, tuple[float, fl
 def wilson(successes: int, count: int) -> tuple[float, float]:
     """95 % Wilson interval of a rate, in %."""
     interval = binomtest(successes, count).proportion_ci(0.95, method="wilson")
-    return 100 * interval.low, 100 * interval.high
+    return float(100 * interval.low), float(100 * interval.high)
 
 
 def success_gap(rows_a: list[list[dict]], rows_b: list[list[dict]]) -> dict:

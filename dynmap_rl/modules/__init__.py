@@ -1,6 +1,7 @@
 """World model and policies: plain ``nn.Module`` building blocks."""
 
 from .checkpoints import (
+    check_policy,
     load_policy,
     load_world_model,
     make_policy,
@@ -30,6 +31,7 @@ __all__ = [
     "Transition",
     "TwoLSTM",
     "WorldModel",
+    "check_policy",
     "delay",
     "load_policy",
     "load_world_model",

@@ -23,13 +23,20 @@ def make_world_model(
     return WorldModel(Normalizer(**constants["action"]), dynamics, latent_size, hidden_size, keypoints)
 
 
-def make_policy(constants: dict, kind: str, world_model: WorldModel, width: int, dropout: float = 0.0):
-    """A fresh policy of a kind, ``feedforward`` or ``recurrent``."""
-    if kind not in POLICIES:
-        raise ValueError(f"unknown policy {kind!r}; choose from {sorted(POLICIES)}")
+def make_policy(
+    constants: dict, kind: str, world_model: WorldModel, **arguments
+) -> FeedforwardPolicy | RecurrentPolicy:
+    """A fresh policy of a kind, ``feedforward`` or ``recurrent``; ``arguments`` are its own (``width``, ...)."""
+    check_policy(kind)
     sizes = world_model.latent_size, world_model.hidden_size
     action, goal = Normalizer(**constants["action"]), Normalizer(**constants["goal"])
-    return POLICIES[kind](*sizes, action, goal, width, dropout)
+    return POLICIES[kind](*sizes, action, goal, **arguments)
+
+
+def check_policy(kind: str) -> None:
+    """Raises ``ValueError`` for an unknown kind."""
+    if kind not in POLICIES:
+        raise ValueError(f"unknown policy {kind!r}; choose from {sorted(POLICIES)}")
 
 
 def save_world_model(folder: Path, model: WorldModel) -> None:

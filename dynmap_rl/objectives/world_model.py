@@ -29,7 +29,8 @@ class WorldModelLoss(LossModule):
         world_model: what is trained.
         beta_z: weight of the latent loss.
         beta_dynamics: weight of each dynamics loss; all quantities have the same.
-        stop_gradient: the latent loss moves the prediction only, not its target ``ENC(I_t)``.
+        stop_gradient: the latent loss moves the predicted change of the latent only. With its full gradient it is
+            least for latents that do not vary, and the reconstruction stalls.
         rgb_steps: decode the frames of so many random steps of a window; None decodes all.
     """
 
@@ -61,16 +62,22 @@ class WorldModelLoss(LossModule):
         with torch.autocast(latent.device.type, enabled=False):
             states = model.predict(latent, tensordict.get(keys.action))
         predicted, hidden1, hidden2 = (x[:, 1:] for x in states)  # (B, T-1, .)
-        target = latent[:, 1:].detach() if self.stop_gradient else latent[:, 1:]
         losses = {
             "loss_rgb": self._rgb_loss(pixels[:, 1:], predicted, hidden1, hidden2),
-            "loss_latent": self.beta_z * rms(predicted - target).mean(),
+            "loss_latent": self.beta_z * self._latent_loss(latent, predicted),
         }
         for name, value in model.decode_dynamics(predicted, hidden1, hidden2).items():
             scale = model.dynamics_decoder.normalizers[name].scale
             truth = tensordict.get((keys.dynamics, name))[:, 1:]
             losses[f"loss_{name}"] = self.beta_dynamics * rms((value - truth) / scale).mean()
         return TensorDict(losses, [])
+
+    def _latent_loss(self, latent, predicted) -> torch.Tensor:
+        before, target = latent[:, :-1], latent[:, 1:]
+        if self.stop_gradient:
+            predicted = predicted - before + before.detach()  # only the predicted change is moved
+            target = target.detach()
+        return rms(predicted - target).mean()
 
     def _rgb_loss(self, pixels, *states) -> torch.Tensor:
         steps = pixels.shape[1]

@@ -1,0 +1,103 @@
+"""What a run leaves behind: ``eval.json``, the table row beside the paper's, figures and an animation."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import torch
+from tensordict import TensorDictBase
+
+from dynmap_rl.envs import scene_seed
+from dynmap_rl.modules import Actor, WorldModel, load_policy
+from dynmap_rl.runs import read_json, write_json
+
+from .paper import TABLE_1, row_name
+from .rollout import episode_rows, roll_out, scene_seeds
+from .statistics import summarize, summarize_seeds
+
+PAPER_START = 1000  # the paper's protocol uses other test scenes than the shared start states
+
+
+def evaluate(
+    world_model: WorldModel, policy, task: str, test_episodes: int = 1000, paper_episodes: int = 50
+) -> dict[str, dict]:
+    """One policy by both protocols: rows and summary on ``test_episodes`` shared start states (``test``) and on
+    ``paper_episodes`` others (``paper``). All episodes run as one batch."""
+    seeds = scene_seeds("test", test_episodes)
+    seeds += scene_seeds("test", paper_episodes, start=PAPER_START)
+    rows = episode_rows(roll_out(Actor(world_model, policy), task, seeds), seeds)
+    parts = {"test": rows[:test_episodes], "paper": rows[test_episodes:]}
+    return {name: {"summary": summarize(part), "rows": _columns(part)} for name, part in parts.items()}
+
+
+def write_report(folder: Path, settings, dataset, world_model, episodes: TensorDictBase, seeds, frozen) -> dict:
+    """Collect the seeds' results into ``eval.json`` and draw the figures.
+
+    Args:
+        folder: run folder with ``seed_N/eval.json`` and ``seed_N/policy``.
+        settings: the recipe's dataclass.
+        dataset: what was trained on.
+        world_model: the frozen one; ``frozen`` is its fingerprint.
+        episodes: held-out demonstrations ``[E, T]``, for the figures.
+        seeds: of the policies.
+    """
+    from .figures import plot_dynamics, plot_reconstruction, save_gif
+
+    results = [read_json(folder / f"seed_{seed}" / "eval.json") for seed in seeds]
+    test = [_rows(r["test"]["rows"]) for r in results]
+    result = {
+        "row": row_name(world_model.supervision),
+        "policy": settings.policy,
+        "task": settings.task,
+        "trained_on": str(dataset),
+        "episodes_trained_on": read_json(Path(dataset) / "meta" / "dynmap.json")["settings"]
+        if Path(dataset).exists()
+        else str(dataset),
+        "seeds": list(seeds),
+        "world_model_sha256": frozen,
+        "paper_protocol": summarize_seeds([_rows(r["paper"]["rows"]) for r in results]),
+        "test_protocol": summarize([row for rows in test for row in rows]),
+        "settings": {k: str(v) if isinstance(v, Path) else v for k, v in dataclasses.asdict(settings).items()},
+        "command": " ".join(["python", *sys.argv]),
+        "results": results,
+    }
+    plot_reconstruction(world_model, episodes[:3], folder / "figures" / "reconstruction.png")
+    plot_dynamics(world_model, episodes[0], folder / "figures" / "dynamics.png")
+    policy = load_policy(folder / f"seed_{seeds[0]}" / "policy")
+    some = [scene_seed("validation", i) for i in range(8)]
+    rollouts = roll_out(Actor(world_model, policy), settings.task, some, keep_pixels=True)
+    save_gif(rollouts, folder / "rollouts.gif")
+    write_json(folder / "eval.json", result)
+    return result
+
+
+def print_row(result: dict) -> None:
+    """The table row, beside the paper's."""
+    ours, test = result["paper_protocol"], result["test_protocol"]
+    low, high = test["SR_interval"]
+    print(f"\n{result['row']}, {result['policy']} policy, {result['task']}: drop rate, position error, success rate")
+    print("  paper's protocol  " + _cells(ours["DR"], ours["PE"], ours["SR"]))
+    paper = TABLE_1.get(result["policy"], {}).get(result["row"])
+    if paper and result["task"] == "balance_reaching":
+        print("  paper             " + _cells(*paper))
+    print(
+        f"  {test['episodes']} episodes     DR {test['DR']:.1f} %   PE {test['PE']:.1f} mm   "
+        f"SR {test['SR']:.1f} % [{low:.1f}, {high:.1f}]"
+    )
+
+
+def _cells(drop, error, success) -> str:
+    return (
+        f"DR {drop[0]:.0f} ({drop[1]:.1f}) %   PE {error[0]:.0f} ({error[1]:.1f}) mm   "
+        f"SR {success[0]:.0f} ({success[1]:.1f}) %"
+    )
+
+
+def _columns(rows: list[dict]) -> dict[str, list]:
+    return {key: [row[key] for row in rows] for key in rows[0]}
+
+
+def _rows(columns: dict[str, list]) -> list[dict]:
+    return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]

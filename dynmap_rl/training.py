@@ -1,0 +1,153 @@
+"""Training loops that the recipes share: the world model alone, and a policy on a frozen world model's states."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from pathlib import Path
+
+import torch
+from tensordict import TensorDictBase
+from torch import nn
+from tqdm import tqdm
+
+from dynmap_rl import runs
+from dynmap_rl.data import augment, sample_windows
+from dynmap_rl.modules import WorldModel
+from dynmap_rl.objectives import WorldModelLoss, imitation_loss
+
+STATES = ("latent", "hidden1", "hidden2")
+
+
+def train_world_model(
+    world_model: WorldModel, episodes: dict[str, TensorDictBase], folder: Path, settings, save_every: int = 250
+) -> None:
+    """Minimise Eq. 4a plus Eq. 5 on augmented windows; a stopped run goes on from its last training state.
+
+    Args:
+        world_model: changed in place.
+        episodes: ``train`` and ``eval``, ``[E, T]``.
+        folder: run folder; gets ``metrics.jsonl`` and the training state.
+        settings: with ``updates``, ``windows``, ``window_steps``, ``rgb_steps``, ``learning_rate``, ``beta_z``,
+            ``beta_dynamics`` and ``world_model_seed``.
+
+    Raises:
+        ValueError: a loss is not finite.
+    """
+    world_model.to(memory_format=torch.channels_last)  # with bfloat16 six times faster on a CPU
+    loss_module = WorldModelLoss(
+        world_model, settings.beta_z, settings.beta_dynamics, rgb_steps=settings.rgb_steps
+    )
+    optimizer = make_optimizer(world_model, settings.learning_rate, weight_decay=1e-4)
+    generator = torch.Generator().manual_seed(settings.world_model_seed)
+    train = episodes["train"].select("pixels", "action", "goal", "dynamics")
+
+    start, path = 0, folder / "checkpoint" / "world_model.pt"
+    if state := runs.load_training_state(path):
+        world_model.load_state_dict(state["model"])
+        optimizer.load_state_dict(state["optimizer"])
+        generator.set_state(state["generator"])
+        start = state["update"]
+        runs.truncate_metrics(folder, start)
+    progress = tqdm(range(start, settings.updates), "world model", settings.updates, initial=start)
+    for update in progress:
+        set_learning_rate(optimizer, settings.learning_rate, update, settings.updates)
+        windows = sample_windows(train, settings.windows, settings.window_steps, generator)
+        windows = augment(windows, generator)
+        with torch.autocast("cpu", torch.bfloat16):
+            losses = loss_module(windows)
+        step(sum(losses.values()), optimizer)
+        done = update + 1
+        if done % 50 == 0 or done == settings.updates:
+            losses = {name: value.item() for name, value in losses.items()}
+            progress.set_postfix({k.removeprefix("loss_"): f"{v:.3f}" for k, v in losses.items()})
+        if done % save_every == 0 or done == settings.updates:
+            errors = prediction_errors(world_model, episodes["eval"])
+            runs.append_metrics(folder, done, **losses, **errors)
+            runs.save_training_state(
+                path,
+                model=world_model.state_dict(),
+                optimizer=optimizer.state_dict(),
+                generator=generator.get_state(),
+                update=done,
+            )
+
+
+def train_policy(
+    policy: nn.Module, features: TensorDictBase, held_out: TensorDictBase, folder: Path, settings, seed: int
+) -> None:
+    """Minimise the L1 imitation loss on precomputed states ``[E, T]`` (the world model is not even here).
+
+    Args:
+        policy: changed in place.
+        features, held_out: what :func:`dynmap_rl.data.compute_features` gave.
+        folder: gets ``metrics.jsonl``.
+        settings: with ``policy_updates``, ``policy_batch`` and ``policy_learning_rate``.
+        seed: of the batches; also the progress bar's line.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    runs.truncate_metrics(folder, 0)
+    optimizer = make_optimizer(policy, settings.policy_learning_rate, weight_decay=1e-3)
+    generator = torch.Generator().manual_seed(seed)
+    keys = [*STATES, "goal"]
+    progress = tqdm(range(settings.policy_updates), f"policy {seed}", position=seed)
+    for update in progress:
+        set_learning_rate(optimizer, settings.policy_learning_rate, update, settings.policy_updates)
+        batch = features[torch.randint(len(features), (settings.policy_batch,), generator=generator)]
+        loss = imitation_loss(policy(*(batch[k] for k in keys)), batch["action"], policy.action)
+        step(loss, optimizer)
+        done = update + 1
+        if done % 100 == 0 or done == settings.policy_updates:
+            with torch.no_grad():
+                predicted = policy(*(held_out[k] for k in keys))
+                validation = imitation_loss(predicted, held_out["action"], policy.action)
+            runs.append_metrics(folder, done, loss=loss, held_out_loss=validation)
+            progress.set_postfix(loss=f"{loss:.4f}", held_out=f"{validation:.4f}")
+
+
+@torch.no_grad()
+def prediction_errors(world_model: WorldModel, episodes: TensorDictBase, batch: int = 10) -> dict[str, float]:
+    """One-step prediction errors on episodes ``[E, T]``: the frames' root mean square (0..1), and the mean absolute
+    error of each decoded quantity's x and y (m, m/s, m/s^2)."""
+    sums: dict[str, float] = {}
+    for chunk in episodes.split(batch):
+        states = world_model.predict(world_model.encode(chunk["pixels"]), chunk["action"])
+        some = [s[:, 1::10] for s in states]  # a tenth of the frames is enough
+        error = world_model.decode_pixels(*some) - chunk["pixels"][:, 1::10] / 255
+        errors = {"rgb": error.square().flatten(2).mean(-1).sqrt().mean()}
+        for name, value in world_model.decode_dynamics(*states).items():
+            difference = (value - chunk["dynamics", name])[:, 1:].abs()
+            errors[name] = difference[..., [0, 1, 3, 4]].mean()
+        for name, value in errors.items():
+            sums[f"error_{name}"] = sums.get(f"error_{name}", 0.0) + value.item() * len(chunk) / len(episodes)
+    return sums
+
+
+def fingerprint(module: nn.Module) -> str:
+    """SHA-256 over all weights and buffers: equal before and after means that nothing has changed."""
+    digest = hashlib.sha256()
+    for name, value in sorted(module.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(value.contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
+def make_optimizer(module: nn.Module, learning_rate: float, weight_decay: float) -> torch.optim.Optimizer:
+    return torch.optim.AdamW(module.parameters(), learning_rate, betas=(0.9, 0.99), weight_decay=weight_decay)
+
+
+def set_learning_rate(optimizer, peak: float, update: int, updates: int) -> None:
+    """100 steps of warm-up, then a cosine to 2 % of the peak."""
+    factor = min(1.0, (update + 1) / 100) * (0.51 + 0.49 * math.cos(math.pi * update / updates))
+    for group in optimizer.param_groups:
+        group["lr"] = peak * factor
+
+
+def step(loss: torch.Tensor, optimizer) -> None:
+    """One optimiser step with clipped gradients; ``ValueError`` where the loss is not finite."""
+    if not torch.isfinite(loss):
+        raise ValueError("the loss is not finite; the last training state is kept, try a lower learning rate")
+    optimizer.zero_grad()
+    loss.backward()
+    nn.utils.clip_grad_norm_([p for g in optimizer.param_groups for p in g["params"]], 1.0)
+    optimizer.step()

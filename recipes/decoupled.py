@@ -1,0 +1,145 @@
+"""Decoupled training (paper, Sec. III-B): pretrain a world model, freeze it, train policies on its states, evaluate.
+
+    python recipes/decoupled.py                                       # RGB+[P+V], recurrent policy
+    python recipes/decoupled.py --supervision none --policy feedforward
+
+With no option it records the demonstrations with the shipped expert first. The same command on the same run folder
+goes on where it was stopped, or says that it is done.
+"""
+
+import concurrent.futures
+import multiprocessing
+from dataclasses import dataclass
+from pathlib import Path
+
+from dynmap_rl.runs import run_recipe
+
+
+@dataclass
+class Config:
+    # Name of the task.
+    task: str = "balance_reaching"
+    # Which dynamics the world model is supervised on: any of position,velocity,acceleration, or none (Only-RGB).
+    supervision: str = "position,velocity"
+    # Policy: feedforward or recurrent.
+    policy: str = "recurrent"
+    # Seeds of the policies, and of the world model.
+    seeds: str = "0,1,2"
+    world_model_seed: int = 0
+    # Dataset: a folder or a hub id; by default datasets/TASK, recorded if it is not there.
+    dataset: str | None = None
+    # Run folder; by default runs/decoupled/TASK/SUPERVISION_POLICY.
+    run: Path | None = None
+    # A world model that is trained already (a folder of another run); by default one is trained here.
+    world_model: Path | None = None
+    # World model: optimiser steps, windows a step, steps a window, decoded frames a window, peak learning rate.
+    updates: int = 4500
+    windows: int = 16
+    window_steps: int = 24
+    rgb_steps: int = 6
+    learning_rate: float = 3e-3
+    beta_z: float = 0.01
+    beta_dynamics: float = 1.0
+    # Encoder with spatial-softmax keypoints beside the plain CNN's features.
+    keypoints: bool = True
+    # Policy: optimiser steps, episodes a step, augmented copies of every demonstration, peak learning rate.
+    policy_updates: int = 1500
+    policy_batch: int = 32
+    copies: int = 4
+    policy_learning_rate: float = 1e-3
+    # Evaluation: scenes of the paper's protocol and of the shared start states.
+    paper_episodes: int = 50
+    test_episodes: int = 1000
+    # Every stage in a minimal size, for tests.
+    smoke: bool = False
+    threads: int = 2
+
+
+SMOKE = {
+    "updates": 4, "windows": 2, "window_steps": 6, "rgb_steps": 2, "policy_updates": 3, "policy_batch": 2,
+    "copies": 1, "paper_episodes": 2, "test_episodes": 3, "seeds": "0,1",
+}  # fmt: skip
+
+
+def main(config: Config) -> None:
+    import torch
+
+    from dynmap_rl import data, modules, runs
+    from dynmap_rl.evaluation import parse_supervision, print_row, write_report
+    from dynmap_rl.training import fingerprint, train_world_model
+
+    if config.smoke:
+        for name, value in SMOKE.items():
+            setattr(config, name, value)
+    supervision = parse_supervision(config.supervision)
+    seeds = [int(seed) for seed in config.seeds.split(",")]
+    name = f"{'_'.join(supervision) or 'none'}_{config.policy}{'_smoke' if config.smoke else ''}"
+    folder = config.run or Path("runs/decoupled") / config.task / name
+    modules.check_policy(config.policy)
+    folder = runs.open_run(folder, config, ignore=("run", "threads"))
+    if (folder / "eval.json").exists():
+        print(f"{folder} is done; delete it to run again")
+        return print_row(runs.read_json(folder / "eval.json"))
+    torch.set_num_threads(config.threads)
+
+    dataset = config.dataset or record(config)
+    constants = data.load_meta(dataset)["normalization"]
+    episodes = {split: data.load_dataset(dataset, split) for split in ("train", "eval")}
+
+    if config.world_model:
+        world_model = modules.load_world_model(config.world_model)
+    else:
+        runs.seed_everything(config.world_model_seed)
+        world_model = modules.make_world_model(constants, supervision, keypoints=config.keypoints)
+        train_world_model(world_model, episodes, folder, config)
+    world_model.eval().requires_grad_(False)
+    frozen = fingerprint(world_model)
+    modules.save_world_model(folder / "world_model", world_model)
+
+    generator = torch.Generator().manual_seed(0)
+    features = data.compute_features(world_model, episodes["train"], config.copies, generator)
+    held_out = data.compute_features(world_model, episodes["eval"])
+    features.memmap(folder / "features" / "train")
+    held_out.memmap(folder / "features" / "eval")
+
+    todo = [seed for seed in seeds if not (folder / f"seed_{seed}" / "eval.json").exists()]
+    with concurrent.futures.ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
+        list(pool.map(train_and_evaluate, [(config, folder, constants, seed) for seed in todo]))
+    if fingerprint(modules.load_world_model(folder / "world_model")) != frozen:
+        raise ValueError("the frozen world model has changed; this run is not valid")
+    result = write_report(folder, config, dataset, world_model, episodes["eval"], seeds, frozen)
+    print_row(result)
+
+
+def record(config: Config) -> Path:
+    from dynmap_rl.data import record_dataset
+
+    if config.smoke:
+        return record_dataset(f"datasets/{config.task}_smoke", config.task, episodes=4, eval_episodes=2)
+    return record_dataset(f"datasets/{config.task}", config.task)
+
+
+def train_and_evaluate(arguments) -> None:
+    """One policy seed, in a process of its own."""
+    config, folder, constants, seed = arguments
+    import torch
+    from tensordict import TensorDict
+
+    from dynmap_rl import modules, runs
+    from dynmap_rl.evaluation import evaluate
+    from dynmap_rl.training import train_policy
+
+    torch.set_num_threads(1)
+    runs.seed_everything(1000 + seed)
+    world_model = modules.load_world_model(folder / "world_model").requires_grad_(False)
+    policy = modules.make_policy(constants, config.policy, world_model)
+    features = TensorDict.load_memmap(folder / "features" / "train")
+    held_out = TensorDict.load_memmap(folder / "features" / "eval")
+    train_policy(policy, features, held_out, folder / f"seed_{seed}", config, seed)
+    modules.save_policy(folder / f"seed_{seed}" / "policy", policy, world_model)
+    result = evaluate(world_model, policy, config.task, config.test_episodes, config.paper_episodes)
+    runs.write_json(folder / f"seed_{seed}" / "eval.json", result)
+
+
+if __name__ == "__main__":
+    run_recipe(main, Config)

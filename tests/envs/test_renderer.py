@@ -1,0 +1,97 @@
+"""The renderer: 1 m x 1 m on the frame, y upwards, nothing of the world changed."""
+
+import numpy as np
+import pygame
+import pytest
+
+from dynmap_rl.envs.renderer import Renderer, box
+from dynmap_rl.envs.scene import GOAL_COLOR, Scene
+from dynmap_rl.envs.tasks import get_task
+from dynmap_rl.envs.world import World
+
+TASK = get_task("balance_reaching")
+SCENE = Scene(cart_x=0.3, cart_y=0.3, goal_x=0.8, goal_y=0.7)
+PIXEL = 1 / 64
+
+
+def draw(scene: Scene = SCENE, **arguments) -> np.ndarray:
+    return Renderer(**arguments).draw(World(scene), TASK)
+
+
+def centroid(frame: np.ndarray, color) -> np.ndarray:
+    """Mean row and column of the pixels of one colour."""
+    return np.argwhere((frame == color).all(-1)).mean(0)
+
+
+def test_frame_format():
+    frame = draw()
+    assert frame.shape == (64, 64, 3)
+    assert frame.dtype == np.uint8
+
+
+def test_background_and_four_flat_colours():
+    frame = draw()
+    assert tuple(frame[0, 0]) == SCENE.background_color
+    colors = {tuple(map(int, c)) for c in frame.reshape(-1, 3)}
+    assert colors == {SCENE.background_color, SCENE.cart_color, SCENE.block_color, GOAL_COLOR}
+
+
+@pytest.mark.parametrize("size", [64, 256])
+def test_objects_are_where_the_world_has_them(size):
+    frame, world = draw(size=size), World(SCENE)
+    places = {
+        SCENE.cart_color: world.position[:2],
+        SCENE.block_color: world.position[3:5],
+        GOAL_COLOR: world.goal,
+    }
+    for color, (x, y) in places.items():
+        expected = (1 - y) * size - 0.5, x * size - 0.5
+        np.testing.assert_allclose(centroid(frame, color), expected, atol=1.0)
+
+
+@pytest.mark.parametrize("name", ["cart_color", "block_color"])
+def test_ten_pixels_of_motion_are_ten_pixels(name):
+    color = getattr(SCENE, name)
+    start = centroid(draw(), color)
+    right = centroid(draw(SCENE.replace(cart_x=0.3 + 10 * PIXEL)), color)
+    up = centroid(draw(SCENE.replace(cart_y=0.3 + 10 * PIXEL)), color)
+    np.testing.assert_allclose(right - start, [0, 10], atol=1e-9)
+    np.testing.assert_allclose(up - start, [-10, 0], atol=1e-9)
+
+
+def test_positive_angles_turn_counterclockwise():
+    corners = np.array(box(0.5, 0.5, np.pi / 6, 0.4, 0.0))
+    right = corners[corners[:, 0].argmax()]
+    np.testing.assert_allclose(right, [0.5 + 0.2 * np.cos(np.pi / 6), 0.6])
+
+
+def test_drawing_leaves_the_world_alone():
+    watched, unwatched = World(SCENE), World(SCENE)
+    renderer = Renderer()
+    for i in range(20):
+        action = np.array([0.01 * np.sin(i), 0.005, 0.002])
+        watched.step(action)
+        unwatched.step(action)
+        first = renderer.draw(watched, TASK)
+        np.testing.assert_array_equal(first, renderer.draw(watched, TASK))
+        np.testing.assert_array_equal(watched.position, unwatched.position)
+
+
+def test_earlier_frames_stay_as_they_were():
+    renderer, world = Renderer(), World(SCENE)
+    first = renderer.draw(world, TASK)
+    copy = first.copy()
+    renderer.draw(World(SCENE.replace(cart_x=0.6)), TASK)
+    np.testing.assert_array_equal(first, copy)
+
+
+def test_supersampling_softens_edges_and_keeps_the_picture():
+    hard, soft = draw(), draw(supersample=4)
+    assert soft.shape == hard.shape
+    assert len(np.unique(soft.reshape(-1, 3), axis=0)) > 4
+    assert np.abs(soft.astype(float) - hard).mean() < 3
+
+
+def test_no_display_is_opened():
+    draw()
+    assert not pygame.display.get_init()
