@@ -69,6 +69,7 @@ def open_run(folder: Path, config, *, ignore: tuple[str, ...] = ()) -> Path:
 def append_metrics(folder: Path, step: int, **metrics: float) -> None:
     """Append one line to ``metrics.jsonl``."""
     line = json.dumps({"step": step, **{k: _plain(v) for k, v in metrics.items()}})
+    Path(folder).mkdir(parents=True, exist_ok=True)
     with open(Path(folder) / "metrics.jsonl", "a") as file:
         file.write(line + "\n")
 
@@ -96,6 +97,7 @@ def truncate_metrics(folder: Path, step: int) -> None:
     """Drop the lines after ``step``: what a killed run wrote beyond its last training state."""
     rows = [row for row in read_metrics(folder) if row["step"] <= step]
     path = Path(folder) / "metrics.jsonl"
+    path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(".metrics.jsonl")
     temporary.write_text("".join(json.dumps(row) + "\n" for row in rows))
     temporary.replace(path)

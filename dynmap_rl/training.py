@@ -94,13 +94,15 @@ def train_policy(
     for update in progress:
         set_learning_rate(optimizer, settings.policy_learning_rate, update, settings.policy_updates)
         batch = features[torch.randint(len(features), (settings.policy_batch,), generator=generator)]
-        loss = imitation_loss(policy(*(batch[k] for k in keys)), batch["action"], policy.action)
+        predicted = policy(*(batch[k] for k in keys))
+        loss = imitation_loss(predicted, batch["action"], policy.action, batch.get("disturbed", None))
         step(loss, optimizer)
         done = update + 1
         if done % 100 == 0 or done == settings.policy_updates:
             with torch.no_grad():
                 predicted = policy(*(held_out[k] for k in keys))
-                validation = imitation_loss(predicted, held_out["action"], policy.action)
+                ignore = held_out.get("disturbed", None)
+                validation = imitation_loss(predicted, held_out["action"], policy.action, ignore)
             runs.append_metrics(folder, done, loss=loss, held_out_loss=validation)
             progress.set_postfix(loss=f"{loss:.4f}", held_out=f"{validation:.4f}")
 

@@ -9,7 +9,7 @@ _MODULES = {
     "load_dataset": "loading",
     "load_meta": "loading",
     "normalization_constants": "recording",
-    "push_dataset": "recording",
+    "push_dataset": "writing",
     "record_dataset": "recording",
     "sample_windows": "augmentation",
 }

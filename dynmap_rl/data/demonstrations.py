@@ -13,6 +13,8 @@ from dynmap_rl.envs.world import EPISODE_STEPS
 from dynmap_rl.experts import list_checkpoints, load_expert
 
 
+PUSHES = 4  # in a disturbed demonstration
+PUSH_ACCELERATION = np.array([2.0, 2.0, 3.0])  # m/s^2, m/s^2, rad/s^2, the largest
 KEYS = [
     "pixels",
     "agent_pos",
@@ -32,21 +34,26 @@ class Plan:
         checkpoint: the expert's checkpoint.
         noise: standard deviation of the noise on the expert's acceleration, in units of its own exploration.
         detours: goals other than the scene's that the expert is sent to first.
+        pushes: spans ``(start, end)`` of steps in which not the expert acts but a random, constant acceleration,
+            so that the demonstration shows how to recover. Imitation leaves these steps out.
     """
 
     scene_seed: int
     checkpoint: str
     noise: float = 0.0
     detours: int = 0
+    pushes: tuple[tuple[int, int], ...] = ()
 
 
 def plan_demonstrations(task: str, split: str, start: int, count: int) -> list[Plan]:
-    """Candidates ``start .. start + count`` of a split: checkpoints in turn, every other one with noise."""
+    """Candidates ``start .. start + count`` of a split: the checkpoints in turn, two of three episodes with pushes."""
     checkpoints = list_checkpoints(task)
-    return [
-        Plan(scene_seed(split, i), checkpoints[i % len(checkpoints)], noise=(i // len(checkpoints)) % 2 * 1.0)
-        for i in range(start, start + count)
-    ]
+    plans = []
+    for i in range(start, start + count):
+        seed = scene_seed(split, i)
+        pushes = _draw_pushes(seed) if i % 3 else ()
+        plans.append(Plan(seed, checkpoints[i % len(checkpoints)], pushes=pushes))
+    return plans
 
 
 def plan_exploration(task: str, split: str, start: int, count: int) -> list[Plan]:
@@ -77,7 +84,7 @@ def roll_out(task: str, plans: list[Plan]) -> TensorDict:
         goal = detours[:, t]  # [E, 2], NaN where the scene's own goal holds
         apart = 2 * (goal - td["dynamics", "position"][:, :2])
         state[:, :2] = torch.where(goal.isnan(), state[:, :2], apart)
-        acceleration = _expert_acceleration(state, plans, networks, rngs)
+        acceleration = _expert_acceleration(t, state, plans, networks, rngs)
         action = np.stack([_to_action(w, a) for w, a in zip(env.worlds, acceleration, strict=True)])
         td = env.step(td.set("action", torch.from_numpy(action)))
         executed = np.stack([w.action for w in env.worlds]).astype(np.float32)
@@ -87,14 +94,25 @@ def roll_out(task: str, plans: list[Plan]) -> TensorDict:
     return torch.stack(steps, 1)
 
 
-def _expert_acceleration(state, plans, networks, rngs) -> np.ndarray:
+def _expert_acceleration(t, state, plans, networks, rngs) -> np.ndarray:
     out = np.empty((len(plans), 3))
     for name, network in networks.items():
         rows = [i for i, p in enumerate(plans) if p.checkpoint == name]
         mean, std = network(state[rows])
         for row, m, s in zip(rows, mean.numpy(), std.numpy(), strict=True):
             out[row] = m + plans[row].noise * s * rngs[row].standard_normal(3)
+    for row, plan in enumerate(plans):
+        for number, (start, end) in enumerate(plan.pushes):
+            if start <= t < end:
+                rng = np.random.default_rng([plan.scene_seed, 3, number])
+                out[row] = rng.uniform(-PUSH_ACCELERATION, PUSH_ACCELERATION)
     return out
+
+
+def _draw_pushes(scene_seed: int) -> tuple[tuple[int, int], ...]:
+    rng = np.random.default_rng([scene_seed, 2])
+    starts = np.sort(rng.integers(2, EPISODE_STEPS - 25, PUSHES))
+    return tuple((int(t), int(t + rng.integers(2, 7))) for t in starts)
 
 
 def _to_action(world, acceleration: np.ndarray) -> np.ndarray:

@@ -27,15 +27,17 @@ def compute_features(
         generator: of the augmentations.
 
     Returns:
-        ``[(1 + copies) E, T]`` with ``latent``, ``hidden1``, ``hidden2``, ``action``, ``goal``.
+        ``[(1 + copies) E, T]`` with ``latent``, ``hidden1``, ``hidden2``, ``action``, ``goal`` and, where the episodes
+        have it, ``disturbed``.
     """
     parts = []
     for copy in range(copies + 1):
-        for chunk in episodes.select("pixels", "action", "goal", "dynamics").split(batch):
+        for chunk in episodes.split(batch):
             if copy:
                 chunk = augment(chunk, generator)
             latent = world_model.encode(chunk["pixels"])
             _, hidden1, hidden2 = world_model.predict(latent, chunk["action"])
             features = {"latent": latent, "hidden1": hidden1, "hidden2": hidden2}
-            parts.append(TensorDict(features, chunk.shape).update(chunk.select("action", "goal")))
+            kept = chunk.select("action", "goal", "disturbed", strict=False)
+            parts.append(TensorDict(features, chunk.shape).update(kept))
     return torch.cat(parts)

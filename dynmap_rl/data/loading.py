@@ -1,7 +1,7 @@
 """LeRobot datasets with dynamics columns as one TensorDict ``[episode, time]``.
 
-The parquet files are read column by column, some ten times faster than frame by frame, and without LeRobot, which takes
-long to import, makes folders for datasets that are not there, and asks the network about damaged ones.
+The parquet files are read column by column, some ten times faster than frame by frame, and without LeRobot, which
+takes long to import, makes folders for datasets that are not there, and asks the network about damaged ones.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ def load_dataset(dataset: str | Path, split: str | None = None) -> TensorDict:
         split: ``train``, ``eval``, or whichever the dataset's ``info.json`` names.
 
     Returns:
-        ``[E, T]`` with ``pixels`` uint8 ``[E, T, 3, 64, 64]``, ``agent_pos`` ``[E, T, 5]``, ``goal`` ``[E, T, 2]`` (the
-        last two of ``agent_pos``), ``action`` ``[E, T, 3]``, ``("dynamics", "position" | "velocity" |
-        "acceleration")`` ``[E, T, 6]`` and, where the dataset has them, ``("next", "reward" | "done" | "success")``
-        ``[E, T, 1]``: what ``LeRobotDataset`` returns, in SI units. Numbers are float32, flags bool.
+        ``[E, T]`` with ``pixels`` uint8 ``[E, T, 3, 64, 64]``, ``agent_pos`` ``[E, T, 5]``, ``goal`` ``[E, T, 2]``
+        (the last two of ``agent_pos``), ``action`` ``[E, T, 3]``, ``("dynamics", "position" | "velocity" |
+        "acceleration")`` ``[E, T, 6]`` and, where the dataset has them, ``("next", "reward" | "done" |
+        "success")`` ``[E, T, 1]``: what ``LeRobotDataset`` returns, in SI units. Numbers are float32, flags bool.
 
     Raises:
         ValueError: there is no such dataset, or it is damaged or of another form. The message says what to do.
@@ -113,7 +113,9 @@ def _read_json(path: Path) -> dict:
     try:
         return json.loads(path.read_text())
     except (OSError, ValueError) as error:
-        raise ValueError(f"{path} cannot be read ({error}); restore it or record the dataset again") from error
+        raise ValueError(
+            f"{path} cannot be read ({error}); restore it or record the dataset again"
+        ) from error
 
 
 def _read_info(root: Path) -> dict:
@@ -176,6 +178,11 @@ def _episodes_and_steps(root: Path, table: pa.Table) -> tuple[int, int]:
         found = f"of {lengths.min()} to {lengths.max()} steps" if len(lengths) else "none"
         raise ValueError(f"{root} must have episodes of equal length, but has {found}; cut or leave out some")
     return len(lengths), int(lengths[0])
+
+
+def _episode_metadata(root: Path) -> list[dict]:
+    meta = read_json(root / META)
+    return meta if isinstance(meta, list) else meta["episodes"]  # a list in a shard
 
 
 def _read_column(root: Path, name: str, column: pa.ChunkedArray) -> torch.Tensor:

@@ -39,7 +39,7 @@ class ImageDecoder(nn.Module):
         x = torch.cat([predicted_latent, hidden1, hidden2], -1)
         batch = x.shape[:-1]
         x = self.expand(x.reshape(-1, x.shape[-1]))
-        return (self.layers(x) + 0.5).unflatten(0, batch)
+        return (self.layers(x) + 0.5).reshape(*batch, 3, 64, 64)
 
 
 class DynamicsDecoder(nn.Module):

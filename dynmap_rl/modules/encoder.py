@@ -40,8 +40,8 @@ class Encoder(nn.Module):
     def forward(self, pixels: torch.Tensor) -> torch.Tensor:
         if pixels.shape[-3:] != (3, 64, 64):
             raise ValueError(f"pixels must be [..., 3, 64, 64], got {list(pixels.shape)}")
-        x = pixels.flatten(0, -4) if pixels.ndim > 4 else pixels.reshape(-1, 3, 64, 64)
-        x = x.to(self.project.weight.dtype).div(255.0).sub(0.5).contiguous(memory_format=torch.channels_last)
+        x = pixels.reshape(-1, 3, 64, 64).contiguous(memory_format=torch.channels_last)
+        x = x.to(self.project.weight.dtype) / 255 - 0.5
         x = self.stem(x)  # (N, C, 16, 16)
         y = self.top(x)  # (N, C, 8, 8)
         if self.keypoints:
@@ -49,7 +49,7 @@ class Encoder(nn.Module):
             features = torch.cat([self.squeeze(y).flatten(1), *points], -1)
         else:
             features = y.flatten(1)
-        return self.project(features).unflatten(0, pixels.shape[:-3])  # (..., Z)
+        return self.project(features).reshape(*pixels.shape[:-3], -1)  # (..., Z)
 
 
 class SpatialSoftmax(nn.Module):

@@ -1,6 +1,7 @@
 """Scenes: drawn from their ranges, determined by the seed, every factor fixable."""
 
 from dataclasses import fields
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -23,7 +24,9 @@ def test_seed_determines_the_scene():
     "ranges",
     [
         SceneRanges(),
-        SceneRanges(cart_width=(0.4, 0.5), friction=(0.2, 0.9), object_color=(0, 50), background_color=(90, 99)),
+        SceneRanges(
+            cart_width=(0.4, 0.5), friction=(0.2, 0.9), object_color=(0, 50), background_color=(90, 99)
+        ),
     ],
 )
 def test_ranges_are_respected_and_filled(ranges):
@@ -57,7 +60,7 @@ def test_impossible_ranges_raise():
 
 def test_splits_never_share_a_seed():
     ends = sorted((scene_seed(s, 0), scene_seed(s, SEEDS_PER_SPLIT - 1)) for s in SPLITS)
-    assert all(last < first for (_, last), (first, _) in zip(ends, ends[1:], strict=False))
+    assert all(last < first for (_, last), (first, _) in pairwise(ends))
     assert scene_seed("test", 5) == scene_seed("test", 4) + 1
 
 

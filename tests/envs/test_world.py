@@ -66,13 +66,15 @@ def test_block_slips_at_friction_times_gravity(friction):
         world = World(Scene(friction=friction, cart_width=2.0, block_width=0.12))
         return push(world, acceleration, seconds=0.5)[3] / 0.5
 
-    assert block_acceleration(0.98 * friction * GRAVITY) == pytest.approx(0.98 * friction * GRAVITY, rel=0.005)
+    assert block_acceleration(0.98 * friction * GRAVITY) == pytest.approx(
+        0.98 * friction * GRAVITY, rel=0.005
+    )
     assert block_acceleration(1.5 * friction * GRAVITY) == pytest.approx(friction * GRAVITY, rel=0.02)
 
 
 def test_block_in_the_air_falls_freely():
     world = World(Scene(cart_y=0.1))
-    world.block.position = world.block.position + (0.0, 0.5)
+    world.block.position = world.block.local_to_world((0.0, 0.5))
     for step in range(1, 4):
         world.step(STILL)
         np.testing.assert_allclose(world.acceleration, [0, 0, 0, 0, -GRAVITY, 0], atol=1e-9)
@@ -94,11 +96,11 @@ def test_mirrored_world_moves_mirrored():
     scene = Scene(cart_x=0.4, block_shift=0.03)
     mirrored = scene.replace(cart_x=0.6, goal_x=0.3, block_shift=-0.03)
     actions = smooth_actions()
-    rows = play(World(scene), actions)
-    mirror = play(World(mirrored), actions * [-1, 1, -1])
-    mirror *= np.tile([-1, 1, -1], 6)
+    position = play(World(scene), actions)[:, :6]
+    mirror = play(World(mirrored), actions * [-1, 1, -1])[:, :6] * [-1, 1, -1, -1, 1, -1]
     mirror[:, [0, 3]] += 1.0
-    np.testing.assert_allclose(mirror, rows, atol=1e-6)
+    np.testing.assert_allclose(mirror, position, atol=2e-4)
+    assert np.ptp(position[:, 5]) > 0.05
 
 
 # The cart
@@ -142,16 +144,17 @@ def test_limits_hold_for_wild_actions(seed):
 
 @pytest.mark.parametrize("x", [-1, 1])
 @pytest.mark.parametrize("y", [-1, 1])
-def test_cart_brakes_before_the_edge_of_the_workspace(x, y):
+def test_cart_brakes_at_the_edge_of_the_workspace(x, y):
+    tolerance = ACCELERATION_LIMIT * CONTROL_DT**2 / 8 + 1e-6  # the last braking step need not be a whole one
     world = World(Scene())
     for _ in range(EPISODE_STEPS):
         world.step(np.array([x, y, x * y], dtype=float))
-        assert (world.commanded >= WORKSPACE_LOW - 1e-6).all()
-        assert (world.commanded <= WORKSPACE_HIGH + 1e-6).all()
+        assert (world.commanded >= WORKSPACE_LOW - tolerance).all()
+        assert (world.commanded <= WORKSPACE_HIGH + tolerance).all()
         assert (np.abs(world.acceleration[:3]) <= ACCELERATION_LIMIT + 1e-4).all()
     edge = np.where(np.array([x, y, x * y]) > 0, WORKSPACE_HIGH, WORKSPACE_LOW)
-    np.testing.assert_allclose(world.commanded, edge, atol=2e-3)
-    np.testing.assert_allclose(world.velocity[:3], 0, atol=2e-2)
+    assert (np.abs(world.commanded - edge) <= tolerance).all()
+    np.testing.assert_allclose(world.velocity[:3], 0, atol=1e-3)
 
 
 def test_full_speed_is_reached():
@@ -225,7 +228,7 @@ def test_invalid_action_raises_and_leaves_the_world_alone(action):
 def place(x: float, y: float, tilt: float) -> World:
     """A world with the block at a pose relative to the cart, one step later."""
     world = World(Scene(cart_width=0.25, cart_height=0.04, block_height=0.16, cart_y=0.4))
-    world.block.position = world.cart.position + (x, y)
+    world.block.position = world.cart.local_to_world((x, y))
     world.block.angle = tilt
     world.step(STILL)
     return world
@@ -251,7 +254,7 @@ def test_drop_is_detected(x, y, tilt, dropped):
 def test_tilt_counts_relative_to_the_cart():
     world = World(Scene(cart_y=0.4))
     world.cart.angle = 0.6
-    world.block.position = world.cart.position + (0.0, 0.25)
+    world.block.position = world.cart.local_to_world((0.0, 0.2))
     world.block.angle = 0.9
     world.step(STILL)
     assert not world.dropped
@@ -259,7 +262,7 @@ def test_tilt_counts_relative_to_the_cart():
 
 def test_drop_latches():
     world = place(0.13, 0.2, 0.0)
-    world.block.position = world.cart.position + (0.0, 0.1)
+    world.block.position = world.cart.local_to_world((0.0, 0.1))
     world.block.velocity = (0.0, 0.0)
     world.step(STILL)
     assert world.block_in_cart[1] == pytest.approx(0.1, abs=1e-3)

@@ -1,0 +1,48 @@
+"""Record expert demonstrations as a LeRobot dataset (paper, Sec. IV-C).
+
+    python recipes/collect.py                                  # 300 + 50 demonstrations of task 1
+    python recipes/collect.py --kind exploration               # other places than the goal, noise, drops
+    python recipes/collect.py --push_to_hub user/name
+
+The experts ship with the package. The same command goes on where it was stopped, or says that it is done.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from dynmap_rl.runs import run_recipe
+
+
+@dataclass
+class Config:
+    # Name of the task.
+    task: str = "balance_reaching"
+    # demonstrations (successful episodes only) or exploration (noisy experts on detours, all episodes).
+    kind: str = "demonstrations"
+    # Episodes of the splits train and eval.
+    episodes: int = 300
+    eval_episodes: int = 50
+    # Folder of the dataset; by default datasets/TASK, or datasets/TASK_exploration.
+    output: Path | None = None
+    # Processes that roll out and write.
+    workers: int = 2
+    # Id on the Hugging Face hub (user/name) to upload the dataset to.
+    push_to_hub: str | None = None
+
+
+def main(config: Config) -> None:
+    from dynmap_rl.data import push_dataset, record_dataset
+    from dynmap_rl.data.loading import META
+
+    suffix = "" if config.kind == "demonstrations" else f"_{config.kind}"
+    output = config.output or Path("datasets") / f"{config.task}{suffix}"
+    complete = (output / META).exists()
+    record_dataset(output, config.task, config.kind, config.episodes, config.eval_episodes, config.workers)
+    print(f"{'complete already' if complete else 'done'}: {output}")
+    if config.push_to_hub:
+        push_dataset(output, config.push_to_hub)
+        print(f"pushed: {config.push_to_hub}")
+
+
+if __name__ == "__main__":
+    run_recipe(main, Config)

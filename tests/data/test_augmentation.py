@@ -1,0 +1,66 @@
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from dynmap_rl.data import augment, sample_windows
+from dynmap_rl.envs import DynmapBatchedEnv
+
+
+def make_episodes(num_envs=8, steps=6):
+    env = DynmapBatchedEnv(num_envs=num_envs, from_pixels=True, seed=0)
+    torch.manual_seed(0)
+    return env.rollout(steps)
+
+
+def cart_center(frame, color):
+    """Row and column, in pixels, of the mean of a colour."""
+    rows, columns = np.nonzero((frame == np.array(color)[:, None, None]).all(0))
+    return rows.mean() + 0.5, columns.mean() + 0.5
+
+
+def test_pixels_and_positions_stay_together():
+    """Where the block is drawn is where the labels say, before and after."""
+    episodes = make_episodes()
+    out = augment(episodes, torch.Generator().manual_seed(0))
+    moved = 0
+    for i in range(len(episodes)):
+        for td in (episodes, out):
+            frame, p = td["pixels"][i, -1].numpy(), td["dynamics", "position"][i, -1]
+            center = int((1 - p[4]) * 64), int(p[3] * 64)
+            row, column = cart_center(frame, frame[:, *center])
+            assert abs(row - float(1 - p[4]) * 64) < 2
+            assert abs(column - float(p[3]) * 64) < 2
+        moved += not torch.equal(episodes["dynamics", "position"][i], out["dynamics", "position"][i])
+    assert moved >= 6
+
+
+def test_velocity_stays_the_derivative_of_position():
+    episodes = make_episodes()
+    out = augment(episodes, torch.Generator().manual_seed(1))
+    for td in (episodes, out):
+        position = td["dynamics", "position"][..., :3]
+        velocity = td["dynamics", "velocity"][..., :3]
+        middle = (velocity[:, 1:] + velocity[:, :-1]) / 2
+        torch.testing.assert_close((position[:, 1:] - position[:, :-1]) / 0.05, middle, atol=1e-4, rtol=1e-3)
+
+
+def test_goal_moves_with_the_cart():
+    episodes = make_episodes()
+    out = augment(episodes, torch.Generator().manual_seed(2))
+    for td in (episodes, out):
+        td["apart"] = td["goal"] - td["dynamics", "position"][..., :2]
+    torch.testing.assert_close(out["apart"].abs(), episodes["apart"].abs(), atol=1e-6, rtol=0)
+
+
+def test_windows_are_pieces_of_episodes():
+    steps = torch.arange(20).expand(5, 20)
+    episodes = TensorDict({"t": steps, "e": torch.arange(5)[:, None].expand(5, 20)}, [5, 20])
+    windows = sample_windows(episodes, 32, 7, torch.Generator().manual_seed(0))
+    assert windows.shape == (32, 7)
+    assert (windows["t"].diff(dim=1) == 1).all()
+    assert (windows["e"] == windows["e"][:, :1]).all()
+    assert (windows["t"][::2, 0] == 0).all()
+    assert len(windows["t"][1::2, 0].unique()) > 4
+    with pytest.raises(ValueError, match="fit"):
+        sample_windows(episodes, 2, 21, torch.Generator())

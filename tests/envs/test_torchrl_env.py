@@ -1,0 +1,168 @@
+"""The batched TorchRL environment: its specs, its resets, and its agreement with the Gymnasium ids."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.envs.utils import check_env_specs
+
+import dynmap_rl  # noqa: F401 (registers the ids)
+from dynmap_rl.envs import DynmapBatchedEnv, SceneRanges
+
+LIMIT = {"position": [0.02, 0.02, 0.05], "acceleration": [3.0, 3.0, 10.0]}
+
+
+def seeded(env: DynmapBatchedEnv, seeds) -> TensorDict:
+    """A reset to the scenes of these seeds."""
+    return env.reset(TensorDict({"scene_seed": torch.tensor(list(seeds))}, [len(seeds)]))
+
+
+def play(env: DynmapBatchedEnv, seeds, actions: torch.Tensor) -> TensorDict:
+    """The ``next`` entries ``[N, T]`` of actions ``[N, T, 3]`` from these scenes, past any drop."""
+    td = seeded(env, seeds)
+    return torch.stack([env.step(td.set("action", a).clone())["next"] for a in actions.unbind(1)], 1)
+
+
+def random_actions(count: int, steps: int, control: str = "position") -> torch.Tensor:
+    generator = torch.Generator().manual_seed(0)
+    return (2 * torch.rand(count, steps, 3, generator=generator) - 1) * torch.tensor(LIMIT[control])
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {},
+        {"num_envs": 3},
+        {"num_envs": 2, "from_pixels": True},
+        {"num_envs": 2, "from_pixels": True, "supersample": 2, "control": "acceleration"},
+    ],
+)
+def test_specs(arguments):
+    check_env_specs(DynmapBatchedEnv(**arguments), seed=0)
+
+
+def test_reward_and_flags_have_a_trailing_dimension():
+    env = DynmapBatchedEnv(num_envs=4)
+    step = env.rollout(1)[:, 0]
+    for key in ("reward", "done", "terminated", "truncated", "is_success", "dropped", "position_error"):
+        assert step["next", key].shape == (4, 1)
+
+
+@pytest.mark.parametrize("control", LIMIT)
+def test_same_trajectory_as_gymnasium(control):
+    seeds, actions = [0, 7, 123_456_789], random_actions(3, 40, control)
+    batched = DynmapBatchedEnv(num_envs=3, from_pixels=True, control=control)
+    start, steps = seeded(batched, seeds), play(batched, seeds, actions)
+    for i, seed in enumerate(seeds):
+        arguments = {"obs_type": "pixels_agent_pos", "control": control}
+        env = gym.make("dynmap_rl/BalanceReaching-v0", **arguments).unwrapped
+        observation, _ = env.reset(seed=seed)
+        same_observation(start[i], observation, env)
+        for t in range(40):
+            observation, reward, terminated, truncated, info = env.step(actions[i, t].numpy())
+            step = steps[i, t]
+            same_observation(step, observation, env)
+            assert step["reward"].item() == np.float32(reward)
+            assert (step["terminated"].item(), step["truncated"].item()) == (terminated, truncated)
+            for key, value in info.items():
+                assert step[key].item() == value
+
+
+def same_observation(td: TensorDict, observation: dict, env: gym.Env) -> None:
+    np.testing.assert_array_equal(td["pixels"].permute(1, 2, 0), observation["pixels"])
+    np.testing.assert_array_equal(td["agent_pos"], observation["agent_pos"])
+    np.testing.assert_array_equal(td["state"], env.task.state(env.world))
+    for name in ("position", "velocity", "acceleration"):
+        np.testing.assert_array_equal(td["dynamics", name], getattr(env.world, name).astype(np.float32))
+
+
+def test_number_of_worlds_does_not_matter():
+    actions = random_actions(8, 30)
+    together = play(DynmapBatchedEnv(num_envs=8, from_pixels=True), range(8), actions)
+    alone = DynmapBatchedEnv(num_envs=1, from_pixels=True)
+    for i in range(8):
+        assert (play(alone, [i], actions[i : i + 1])[0] == together[i]).all()
+
+
+def test_partial_reset_touches_only_the_masked_worlds():
+    env = DynmapBatchedEnv(num_envs=3, seed=0)
+    td = env.rollout(5)[:, -1]["next"].exclude("reward")
+    worlds = list(env.worlds)
+    mask = torch.tensor([[False], [True], [False]])
+    after = env.reset(td.clone().set("_reset", mask))
+    assert [a is b for a, b in zip(env.worlds, worlds, strict=True)] == [True, False, True]
+    assert [w.steps for w in env.worlds] == [5, 0, 5]
+    assert (after[0] == td[0]).all() and (after[2] == td[2]).all()
+    assert not torch.equal(after["goal"][1], td["goal"][1])
+    assert (after["dynamics", "velocity"][1] == 0).all()
+
+
+def test_seed_determines_every_scene_that_follows():
+    def goals(env, seed):
+        env.set_seed(seed)
+        return torch.stack([env.reset()["goal"] for _ in range(2)])
+
+    env = DynmapBatchedEnv(num_envs=2)
+    first = goals(env, 1)
+    assert torch.equal(goals(env, 1), first)
+    assert torch.equal(goals(DynmapBatchedEnv(num_envs=2), 1), first)
+    assert not torch.equal(goals(env, 2), first)
+    assert len(first.reshape(-1, 2).unique(dim=0)) == 4
+
+
+def test_ranges_are_a_parameter():
+    env = DynmapBatchedEnv(num_envs=5, ranges=SceneRanges(cart_width=(0.4, 0.5)))
+    env.reset()
+    assert all(0.4 <= world.scene.cart_width <= 0.5 for world in env.worlds)
+
+
+def test_episodes_follow_each_other_in_a_rollout():
+    env = DynmapBatchedEnv(num_envs=2, seed=0)
+    rollout = env.rollout(250, lambda td: td.set("action", torch.zeros(2, 3)), break_when_any_done=False)
+    done = rollout["next", "done"].squeeze(-1)
+    assert done.nonzero()[:, 1].tolist() == [119, 239, 119, 239]
+    goals = rollout["goal"]
+    assert torch.equal(goals[:, 0], goals[:, 119])
+    assert (goals[:, 119] != goals[:, 120]).all()
+    assert (rollout["dynamics", "velocity"][:, 120] == 0).all()
+
+
+def test_scene_seeds_hold_for_one_episode():
+    env = DynmapBatchedEnv(num_envs=2, seed=0)
+    policy = lambda td: td.set("action", torch.zeros(2, 3))  # noqa: E731
+    start = seeded(env, [3, 3])
+    rollout = env.rollout(121, policy, auto_reset=False, tensordict=start, break_when_any_done=False)
+    assert torch.equal(rollout["goal"][0, 0], rollout["goal"][1, 0])
+    assert not torch.equal(rollout["goal"][0, 120], rollout["goal"][1, 120])
+
+
+def test_works_in_a_collector():
+    env = DynmapBatchedEnv(num_envs=2, seed=0)
+    collector = Collector(env, None, frames_per_batch=20, total_frames=60)
+    batches = list(collector)
+    assert [batch.shape for batch in batches] == [(2, 10)] * 3
+    position = torch.cat([batch["dynamics", "position"] for batch in batches], 1)
+    following = torch.cat([batch["next", "dynamics", "position"] for batch in batches], 1)
+    going_on = ~torch.cat([batch["next", "done"] for batch in batches], 1)[:, :-1].squeeze(-1)
+    assert torch.equal(position[:, 1:][going_on], following[:, :-1][going_on])
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ({"num_envs": 0}, "num_envs must be at least 1"),
+        ({"control": "nope"}, "unknown control 'nope'"),
+        ({"task": "nope"}, "unknown task 'nope'"),
+    ],
+)
+def test_wrong_argument_raises(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        DynmapBatchedEnv(**arguments)
+
+
+def test_invalid_action_raises():
+    env = DynmapBatchedEnv(num_envs=2)
+    with pytest.raises(ValueError, match="3 finite numbers"):
+        env.step(env.reset().set("action", torch.full((2, 3), torch.nan)))

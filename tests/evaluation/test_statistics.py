@@ -1,0 +1,51 @@
+import pytest
+
+from dynmap_rl.evaluation import parse_supervision, row_name, success_gap, summarize, summarize_seeds, wilson
+
+
+def rows(successes, dropped=0, count=10, error=0.02):
+    return [
+        {"scene_seed": i, "success": i < successes, "dropped": i >= count - dropped, "position_error": error}
+        for i in range(count)
+    ]
+
+
+def test_rates_are_percentages_and_the_error_is_in_mm():
+    summary = summarize(rows(6, dropped=2))
+    assert (summary["SR"], summary["DR"], summary["episodes"]) == (60.0, 20.0, 10)
+    assert summary["PE"] == pytest.approx(20.0)
+
+
+def test_wilson_interval_is_the_textbook_one():
+    assert wilson(46, 50) == pytest.approx((81.2, 96.8), abs=0.1)  # 92 % of 50
+    low, high = wilson(0, 10)
+    assert low == pytest.approx(0.0, abs=1e-9) and 25 < high < 31
+
+
+def test_paper_s_protocol_is_mean_and_standard_deviation_over_seeds():
+    mean, std = summarize_seeds([rows(4), rows(6), rows(8)])["SR"]
+    assert mean == pytest.approx(60.0)
+    assert std == pytest.approx(16.33, abs=0.01)
+
+
+def test_gap_is_paired_and_has_an_interval():
+    result = success_gap([rows(80, count=100)], [rows(60, count=100)])
+    assert result["gap"] == pytest.approx(20.0)
+    assert result["interval"][0] < 20 < result["interval"][1]
+    same = success_gap([rows(5)], [rows(5)])
+    assert same == {"gap": 0.0, "interval": (0.0, 0.0)}
+
+
+def test_gap_refuses_other_start_states():
+    other = [dict(row, scene_seed=row["scene_seed"] + 1) for row in rows(5)]
+    with pytest.raises(ValueError, match="start states"):
+        success_gap([rows(5)], [other])
+
+
+def test_row_names_are_the_paper_s():
+    assert row_name(()) == "Only-RGB"
+    assert row_name(("velocity", "position")) == "RGB+[P+V]"
+    assert parse_supervision("none") == ()
+    assert parse_supervision("velocity, position") == ("position", "velocity")
+    with pytest.raises(ValueError, match="jerk"):
+        parse_supervision("jerk")

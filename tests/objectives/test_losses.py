@@ -1,0 +1,99 @@
+import pytest
+import torch
+from tensordict import TensorDict
+
+from dynmap_rl.modules import DYNAMICS, Normalizer, make_world_model
+from dynmap_rl.objectives import WorldModelLoss, imitation_loss
+from dynmap_rl.objectives.world_model import rms
+
+CONSTANTS = {
+    "action": {"low": [-0.02, -0.02, -0.05], "high": [0.02, 0.02, 0.05]},
+    **{q: {"low": [-2.0] * 6, "high": [2.0] * 6} for q in DYNAMICS},
+}
+
+
+def batch(b=2, t=5):
+    return TensorDict(
+        {
+            "pixels": torch.randint(0, 256, (b, t, 3, 64, 64), dtype=torch.uint8),
+            "action": 0.02 * torch.randn(b, t, 3),
+            "dynamics": {q: torch.rand(b, t, 6) for q in DYNAMICS},
+        },
+        [b, t],
+    )
+
+
+def make(supervision=DYNAMICS, **arguments):
+    torch.manual_seed(0)
+    model = make_world_model(CONSTANTS, supervision, latent_size=16, hidden_size=24)
+    return model, WorldModelLoss(model, **arguments)
+
+
+@pytest.mark.parametrize("supervision", [(), ("position",), ("velocity", "acceleration"), DYNAMICS])
+def test_the_losses_are_those_of_the_supervision(supervision):
+    _, loss = make(supervision)
+    losses = loss(batch())
+    assert set(losses.keys()) == {"loss_rgb", "loss_latent", *(f"loss_{q}" for q in supervision)}
+    assert all(value.shape == () and value > 0 for value in losses.values())
+
+
+@torch.no_grad()
+def test_dynamics_loss_is_the_paper_s_norm_of_the_normalised_error_from_t_1_on():
+    model, loss = make(("velocity",))
+    td = batch()
+    states = model.predict(model.encode(td["pixels"]), td["action"])
+    error = (model.decode_dynamics(*states)["velocity"] - td["dynamics", "velocity"]) / 2.0
+    expected = error[:, 1:].norm(dim=-1).mean() / 6**0.5
+    torch.testing.assert_close(loss(td)["loss_velocity"], expected, rtol=1e-4, atol=1e-6)
+    td["dynamics", "velocity"][:, 0] += 100.0  # there is no prediction for t = 0
+    torch.testing.assert_close(loss(td)["loss_velocity"], expected, rtol=1e-4, atol=1e-6)
+
+
+def test_an_off_by_one_would_be_seen():
+    """A model that copies its input frame predicts a sequence shifted by one step, and only that one, exactly."""
+    _, loss = make(())
+    frames = torch.randint(0, 256, (1, 6, 3, 64, 64), dtype=torch.uint8)
+    loss.world_model.decode_pixels = lambda *_: frames[:, :-1] / 255  # what stood at t - 1
+    td = TensorDict({"pixels": frames, "action": torch.zeros(1, 6, 3)}, [1, 6])
+    assert loss(td)["loss_rgb"] > 0.1
+    td["pixels"] = torch.cat([frames[:, :1], frames[:, :-1]], 1)
+    assert loss(td)["loss_rgb"] < 1e-3
+
+
+def test_stop_gradient_keeps_the_latent_loss_out_of_the_target():
+    model, loss = make((), beta_z=1.0, stop_gradient=True)
+    torch.nn.init.zeros_(model.transition.change.weight)
+    loss(batch())["loss_latent"].backward()
+    assert model.transition.change.bias.grad.abs().sum() > 0
+    assert all(p.grad is None or p.grad.abs().sum() == 0 for p in model.encoder.parameters())
+    model, loss = make((), beta_z=1.0, stop_gradient=False)
+    loss(batch())["loss_latent"].backward()
+    assert any(p.grad.abs().sum() > 0 for p in model.encoder.parameters())
+
+
+def test_weights_scale_their_terms():
+    torch.manual_seed(1)
+    td = batch()
+    _, plain = make(("position",), beta_z=1.0, beta_dynamics=1.0)
+    _, heavy = make(("position",), beta_z=2.0, beta_dynamics=3.0)
+    torch.testing.assert_close(heavy(td)["loss_latent"], 2 * plain(td)["loss_latent"])
+    torch.testing.assert_close(heavy(td)["loss_position"], 3 * plain(td)["loss_position"])
+
+
+def test_keys_can_be_renamed():
+    _, loss = make(("position",))
+    td = batch().rename_key_("pixels", "frame").rename_key_("dynamics", "truth")
+    loss.set_keys(pixels="frame", dynamics="truth")
+    assert loss(td)["loss_position"] > 0
+
+
+def test_imitation_loss_is_the_mean_absolute_error_in_normalised_units():
+    normalizer = Normalizer([-2.0, -4.0], [2.0, 4.0])
+    predicted, action = torch.tensor([[1.0, 0.0]]), torch.tensor([[0.0, 2.0]])
+    assert imitation_loss(predicted, action, normalizer).item() == pytest.approx(0.5)
+
+
+def test_rms_has_a_gradient_at_zero():
+    x = torch.zeros(3, requires_grad=True)
+    rms(x).backward()
+    assert x.grad.isfinite().all()

@@ -1,0 +1,108 @@
+from types import SimpleNamespace
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from dynmap_rl import runs
+from dynmap_rl.data import compute_features
+from dynmap_rl.modules import DYNAMICS, make_policy, make_world_model
+from dynmap_rl.training import fingerprint, train_policy, train_world_model
+
+CONSTANTS = {
+    "action": {"low": [-0.02, -0.02, -0.05], "high": [0.02, 0.02, 0.05]},
+    "goal": {"low": [0.0, 0.0], "high": [1.0, 1.0]},
+    "position": {"low": [0.0] * 6, "high": [1.0] * 6},
+}
+SETTINGS = SimpleNamespace(
+    updates=6,
+    windows=2,
+    window_steps=5,
+    rgb_steps=2,
+    learning_rate=1e-3,
+    beta_z=0.1,
+    beta_dynamics=1.0,
+    world_model_seed=0,
+    policy_updates=4,
+    policy_batch=2,
+    policy_learning_rate=1e-3,
+)
+
+
+def make_episodes(count=3, steps=12):
+    generator = torch.Generator().manual_seed(0)
+    return TensorDict(
+        {
+            "pixels": torch.randint(0, 256, (count, steps, 3, 64, 64), dtype=torch.uint8, generator=generator),
+            "action": 0.01 * torch.randn(count, steps, 3, generator=generator),
+            "goal": torch.rand(count, steps, 2, generator=generator),
+            "dynamics": {q: torch.rand(count, steps, 6, generator=generator) for q in DYNAMICS},
+        },
+        [count, steps],
+    )
+
+
+def make_model():
+    torch.manual_seed(0)
+    return make_world_model(CONSTANTS, ("position",), latent_size=16, hidden_size=24)
+
+
+class Stop(Exception):
+    pass
+
+
+def test_a_resumed_world_model_equals_an_uninterrupted_one(tmp_path, monkeypatch):
+    episodes = dict.fromkeys(("train", "eval"), make_episodes())
+    whole = make_model()
+    train_world_model(whole, episodes, tmp_path / "whole", SETTINGS, save_every=2)
+
+    save, calls = runs.save_training_state, []
+
+    def save_then_stop(*args, **state):
+        save(*args, **state)
+        calls.append(1)
+        if len(calls) == 2:
+            raise Stop
+
+    monkeypatch.setattr(runs, "save_training_state", save_then_stop)
+    with pytest.raises(Stop):
+        train_world_model(make_model(), episodes, tmp_path / "parts", SETTINGS, save_every=2)
+    runs.append_metrics(tmp_path / "parts", 5, loss_rgb=0.0)  # written after the last state, then killed
+    monkeypatch.undo()
+    resumed = make_model()
+    train_world_model(resumed, episodes, tmp_path / "parts", SETTINGS, save_every=2)
+
+    assert fingerprint(resumed) == fingerprint(whole)
+    assert runs.read_metrics(tmp_path / "parts") == runs.read_metrics(tmp_path / "whole")
+
+
+def test_training_a_policy_leaves_the_world_model_as_it_was(tmp_path):
+    model = make_model().eval().requires_grad_(False)
+    before = fingerprint(model)
+    features = compute_features(model, make_episodes(), copies=1, generator=torch.Generator().manual_seed(0))
+    policy = make_policy(CONSTANTS, "recurrent", model, width=16)
+    untrained = fingerprint(policy)
+    train_policy(policy, features, features, tmp_path, SETTINGS, seed=0)
+    assert fingerprint(model) == before
+    assert fingerprint(policy) != untrained
+    with torch.no_grad():
+        next(model.parameters()).add_(1e-6)
+    assert fingerprint(model) != before
+
+
+def test_features_are_the_plain_episodes_first_then_the_copies():
+    model = make_model().eval()
+    episodes = make_episodes()
+    features = compute_features(model, episodes, copies=2, generator=torch.Generator().manual_seed(0))
+    assert features.shape == (9, 12)
+    assert torch.equal(features["action"][:3], episodes["action"])
+    assert not torch.equal(features["goal"][3:6], episodes["goal"])
+    with torch.no_grad():
+        torch.testing.assert_close(features["latent"][:3], model.encode(episodes["pixels"]))
+
+
+def test_a_loss_that_is_not_finite_stops_the_run(tmp_path):
+    episodes = make_episodes()
+    episodes["dynamics", "position"][:] = float("nan")
+    with pytest.raises(ValueError, match="not finite"):
+        train_world_model(make_model(), {"train": episodes, "eval": episodes}, tmp_path, SETTINGS)
