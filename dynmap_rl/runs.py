@@ -175,9 +175,12 @@ def run_recipe(main, config_class) -> None:
     """
     import draccus
 
-    arguments = sys.argv[1:]
-    debug = "--debug" in arguments
-    arguments = [a for a in arguments if a != "--debug"]
+    arguments = [a for a in sys.argv[1:] if a != "--debug"]
+    debug = len(arguments) < len(sys.argv) - 1
+    flags = {f"--{f.name}" for f in dataclasses.fields(config_class) if f.type in (bool, "bool")}
+    for i, argument in reversed(list(enumerate(arguments))):  # a bare flag means true
+        if argument in flags and arguments[i + 1 : i + 2] not in (["true"], ["false"]):
+            arguments.insert(i + 1, "true")
     try:
         config = draccus.parse(config_class, args=arguments, exit_on_error=False)
         main(config)

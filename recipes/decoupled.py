@@ -9,6 +9,7 @@ goes on where it was stopped, or says that it is done.
 
 import concurrent.futures
 import multiprocessing
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,7 +39,7 @@ class Config:
     window_steps: int = 24
     rgb_steps: int = 6
     learning_rate: float = 3e-3
-    beta_z: float = 0.01
+    beta_z: float = 0.1
     beta_dynamics: float = 1.0
     # Encoder with spatial-softmax keypoints beside the plain CNN's features.
     keypoints: bool = True
@@ -108,7 +109,9 @@ def main(config: Config) -> None:
     if fingerprint(modules.load_world_model(folder / "world_model")) != frozen:
         raise ValueError("the frozen world model has changed; this run is not valid")
     result = write_report(folder, config, dataset, world_model, episodes["eval"], seeds, frozen)
+    shutil.rmtree(folder / "features")
     print_row(result)
+    print(f"figures, rollouts and eval.json are in {folder}")
 
 
 def record(config: Config) -> Path:

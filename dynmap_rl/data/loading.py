@@ -41,6 +41,7 @@ def load_dataset(dataset: str | Path, split: str | None = None) -> TensorDict:
         (the last two of ``agent_pos``), ``action`` ``[E, T, 3]``, ``("dynamics", "position" | "velocity" |
         "acceleration")`` ``[E, T, 6]`` and, where the dataset has them, ``("next", "reward" | "done" |
         "success")`` ``[E, T, 1]``: what ``LeRobotDataset`` returns, in SI units. Numbers are float32, flags bool.
+        ``disturbed`` ``[E, T, 1]`` says where a push acted instead of the expert (see ``demonstrations.Plan``).
 
     Raises:
         ValueError: there is no such dataset, or it is damaged or of another form. The message says what to do.
@@ -55,6 +56,7 @@ def load_dataset(dataset: str | Path, split: str | None = None) -> TensorDict:
     data = {key: _read_column(root, name, table[name]).reshape(*shape, -1) for key, name in columns.items()}
     data["goal"] = data["agent_pos"][..., -2:].clone()
     data["pixels"] = _decode_frames(root, table[CAMERA]).unflatten(0, shape)
+    data["disturbed"] = _mark_pushes(root, table, shape)
     return TensorDict(data, shape)
 
 
@@ -64,8 +66,8 @@ def load_meta(dataset: str | Path) -> dict:
     Returns:
         ``format``, ``task``, ``kind``, ``splits`` (name to first episode and the one after the last),
         ``normalization`` (see :func:`dynmap_rl.data.normalization_constants`), and ``episodes``, a dict for each:
-        ``episode_index``, ``split``, ``scene_seed``, ``scene``, ``checkpoint``, ``noise``, ``detours``, ``success``,
-        ``dropped``, ``position_error`` (m).
+        ``episode_index``, ``split``, ``scene_seed``, ``checkpoint``, ``noise``, ``detours``, ``pushes``, ``scene``,
+        ``success``, ``dropped``, ``position_error`` (m).
 
     Raises:
         ValueError: there is no such dataset, or it is not one of ours.
@@ -195,6 +197,16 @@ def _read_column(root: Path, name: str, column: pa.ChunkedArray) -> torch.Tensor
     if column.null_count or not np.isfinite(values).all():
         raise ValueError(f"{root} has numbers in {name} that are missing or not finite; record it again")
     return torch.from_numpy(values)
+
+
+def _mark_pushes(root: Path, table: pa.Table, shape: tuple[int, int]) -> torch.Tensor:
+    disturbed = torch.zeros(*shape, 1, dtype=torch.bool)
+    rows = _read_json(root / META)["episodes"] if (root / META).exists() else []
+    pushes = {row["episode_index"]: row.get("pushes", ()) for row in rows}
+    for episode, index in enumerate(table["episode_index"].to_numpy()[:: shape[1]].tolist()):
+        for start, end in pushes.get(index, ()):
+            disturbed[episode, start:end] = True
+    return disturbed
 
 
 def _decode_frames(root: Path, column: pa.ChunkedArray) -> torch.Tensor:

@@ -33,6 +33,7 @@ from .loading import META, load_meta
 from .writing import merge_datasets, write_episodes
 
 FORMAT = 1
+ROWS = "episodes.json"  # a shard's rows of the metadata
 KINDS = ("demonstrations", "exploration")
 SHARD_EPISODES = 25
 CANDIDATES_PER_SHARD = 250  # scenes that belong to a shard, of which it takes the first that succeed
@@ -191,13 +192,13 @@ def _run_shards(shards: list[Shard], workers: int):
                 future.result()
                 yield futures[future]
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)  # what is being written is finished
+            pool.shutdown(wait=False, cancel_futures=True)
             raise
 
 
 def _start_worker() -> None:
-    """Leave Ctrl-C to the parent, and end when the parent does, even if it is killed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """End at once and without a word on Ctrl-C, and when the parent ends, even if it is killed."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     parent = multiprocessing.parent_process()
     threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
 
@@ -211,7 +212,8 @@ def _record_shard(shard: Shard) -> None:
         torch.set_num_threads(threads)
     temporary = shard.folder.with_name(f"{shard.folder.name}.tmp")
     write_episodes(temporary, episodes, get_task(shard.task).description)
-    write_json(temporary / META, [_describe(shard.task, *e) for e in zip(plans, episodes, strict=True)])
+    rows = [_describe(shard.task, *e) for e in zip(plans, episodes, strict=True)]
+    write_json(temporary / ROWS, rows)
     temporary.replace(shard.folder)
 
 
@@ -255,7 +257,7 @@ def _describe(task: str, plan: Plan, episode: TensorDict) -> dict:
 
 
 def _merge(shards: list[Shard], folder: Path, settings: dict) -> None:
-    rows = [{"split": s.split, **row} for s in shards for row in read_json(s.folder / META)]
+    rows = [{"split": s.split, **row} for s in shards for row in read_json(s.folder / ROWS)]
     train = settings["episodes"]
     splits = {"train": [0, train], "eval": [train, len(rows)]}
     episodes = merge_datasets([s.folder for s in shards], folder, splits)

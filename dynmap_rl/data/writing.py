@@ -116,7 +116,7 @@ def push_dataset(root: str | Path, repo_id: str) -> None:
 
     Raises:
         ValueError: the folder is no recording of ours.
-        OSError: the hub refuses it.
+        OSError: the hub refuses it or cannot be reached.
     """
     meta = load_meta(root)
     exploring = meta["kind"] == "exploration"
@@ -127,7 +127,7 @@ def push_dataset(root: str | Path, repo_id: str) -> None:
         episodes=len(meta["episodes"]),
         steps=EPISODE_STEPS,
         fps=FPS,
-        selection="with noise and detours" if exploring else "successful episodes only",
+        selection="with noise and detours" if exploring else "successful episodes, most with pushes",
         dt=CONTROL_DT,
         meta=META,
         splits=", ".join(f"{name} {first} to {end - 1}" for name, (first, end) in meta["splits"].items()),
@@ -135,8 +135,14 @@ def push_dataset(root: str | Path, repo_id: str) -> None:
     with quiet():
         from lerobot.datasets import LeRobotDataset
 
-        dataset = LeRobotDataset(repo_id, root=root, video_backend="pyav")
-        dataset.push_to_hub(tags=["dynamics", "world-model"], license="mit", dataset_description=description)
+        try:
+            dataset = LeRobotDataset(repo_id, root=root, video_backend="pyav")
+            dataset.push_to_hub(tags=["dynamics"], license="mit", dataset_description=description)
+        except Exception as error:  # of the hub's client, or of the HTTP library below it
+            reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+            raise OSError(
+                f"cannot push {root} to {repo_id} ({reason}); check the name, the network, and `hf auth login`"
+            ) from error
 
 
 def _to_columns(episodes: TensorDict) -> dict[str, np.ndarray]:

@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 from tensordict import TensorDictBase
 
+from dynmap_rl.data import load_meta
 from dynmap_rl.envs import scene_seed
 from dynmap_rl.modules import Actor, WorldModel, load_policy
 from dynmap_rl.runs import read_json, write_json
@@ -45,16 +46,14 @@ def write_report(folder: Path, settings, dataset, world_model, episodes: TensorD
     """
     from .figures import plot_dynamics, plot_reconstruction, save_gif
 
+    meta = load_meta(dataset)
     results = [read_json(folder / f"seed_{seed}" / "eval.json") for seed in seeds]
     test = [_rows(r["test"]["rows"]) for r in results]
     result = {
         "row": row_name(world_model.supervision),
         "policy": settings.policy,
         "task": settings.task,
-        "trained_on": str(dataset),
-        "episodes_trained_on": read_json(Path(dataset) / "meta" / "dynmap.json")["settings"]
-        if Path(dataset).exists()
-        else str(dataset),
+        "trained_on": {"dataset": str(dataset), "kind": meta["kind"], "episodes": meta["splits"]["train"][1]},
         "seeds": list(seeds),
         "world_model_sha256": frozen,
         "paper_protocol": summarize_seeds([_rows(r["paper"]["rows"]) for r in results]),

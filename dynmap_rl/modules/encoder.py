@@ -40,8 +40,13 @@ class Encoder(nn.Module):
     def forward(self, pixels: torch.Tensor) -> torch.Tensor:
         if pixels.shape[-3:] != (3, 64, 64):
             raise ValueError(f"pixels must be [..., 3, 64, 64], got {list(pixels.shape)}")
-        x = pixels.reshape(-1, 3, 64, 64).contiguous(memory_format=torch.channels_last)
-        x = x.to(self.project.weight.dtype) / 255 - 0.5
+        x = pixels.reshape(-1, 3, 64, 64)
+        # Without gradients in chunks that stay in the processor's cache: twice as fast.
+        chunks = (x,) if torch.is_grad_enabled() else x.split(64)
+        return torch.cat([self._encode(chunk) for chunk in chunks]).reshape(*pixels.shape[:-3], -1)
+
+    def _encode(self, x: torch.Tensor) -> torch.Tensor:
+        x = x.contiguous(memory_format=torch.channels_last).to(self.project.weight.dtype) / 255 - 0.5
         x = self.stem(x)  # (N, C, 16, 16)
         y = self.top(x)  # (N, C, 8, 8)
         if self.keypoints:
@@ -49,7 +54,7 @@ class Encoder(nn.Module):
             features = torch.cat([self.squeeze(y).flatten(1), *points], -1)
         else:
             features = y.flatten(1)
-        return self.project(features).reshape(*pixels.shape[:-3], -1)  # (..., Z)
+        return self.project(features)  # (N, Z)
 
 
 class SpatialSoftmax(nn.Module):

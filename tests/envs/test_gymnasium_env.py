@@ -117,6 +117,7 @@ def test_render_has_the_size_asked_for_and_shows_the_observed_scene():
     env = make(obs_type="pixels", render_mode="rgb_array", render_size=96)
     observation, _ = env.reset(seed=0)
     assert env.render().shape == (96, 96, 3)
+    assert env.render().flags.writeable and observation.flags.writeable
     same_size = make(obs_type="pixels", render_mode="rgb_array", render_size=64)
     same_size.reset(seed=0)
     np.testing.assert_array_equal(same_size.render(), observation)

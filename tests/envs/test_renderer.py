@@ -59,10 +59,12 @@ def test_ten_pixels_of_motion_are_ten_pixels(name):
     np.testing.assert_allclose(up - start, [-10, 0], atol=1e-9)
 
 
-def test_positive_angles_turn_counterclockwise():
-    corners = np.array(box(0.5, 0.5, np.pi / 6, 0.4, 0.0))
-    right = corners[corners[:, 0].argmax()]
-    np.testing.assert_allclose(right, [0.5 + 0.2 * np.cos(np.pi / 6), 0.6])
+def test_box_is_turned_counterclockwise_about_its_centre():
+    angle = np.pi / 6
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    level = np.array(box(0, 0, 0, 0.4, 0.2))
+    np.testing.assert_allclose(level, [(-0.2, -0.1), (0.2, -0.1), (0.2, 0.1), (-0.2, 0.1)])
+    np.testing.assert_allclose(box(0.5, 0.3, angle, 0.4, 0.2), level @ turn.T + [0.5, 0.3])
 
 
 def test_drawing_leaves_the_world_alone():

@@ -60,6 +60,14 @@ def test_block_tips_at_gravity_times_width_over_height(width, height, direction)
     assert tips(1.02 * threshold)
 
 
+@pytest.mark.parametrize("width, height", [(0.06, 0.20), (0.08, 0.16)])
+def test_block_tips_about_its_edge_with_the_moment_of_a_box(width, height):
+    acceleration = 2 * GRAVITY * width / height
+    expected = 1.5 * (acceleration * height - GRAVITY * width) / (width**2 + height**2)
+    world = World(Scene(block_width=width, block_height=height, friction=1.0))
+    assert push(world, acceleration, CONTROL_DT)[5] / CONTROL_DT == pytest.approx(expected, rel=0.05)
+
+
 @pytest.mark.parametrize("friction", [0.05, 0.1, 0.2])
 def test_block_slips_at_friction_times_gravity(friction):
     def block_acceleration(acceleration):
@@ -90,6 +98,14 @@ def test_resting_block_rests(block_shift):
     assert np.abs(rows[:, 6:12]).max() < 0.01
     assert world.block.kinetic_energy < 1e-9
     assert not world.dropped
+
+
+def test_carried_block_neither_sinks_in_nor_lifts_off():
+    world = World(Scene(cart_height=0.04, block_height=0.16))
+    for action in smooth_actions(steps=EPISODE_STEPS):
+        world.step(action)
+        assert world.block_in_cart[1] == pytest.approx(0.1, abs=5e-4)
+        assert world.block_in_cart[2] == pytest.approx(0.0, abs=5e-3)
 
 
 def test_mirrored_world_moves_mirrored():

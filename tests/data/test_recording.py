@@ -1,0 +1,198 @@
+"""What is recorded is what happened, however the recording was interrupted."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from dynmap_rl.data import load_dataset, load_meta, normalization_constants, record_dataset, recording
+from dynmap_rl.data.demonstrations import Plan, roll_out
+from dynmap_rl.data.writing import FEATURES
+from dynmap_rl.envs import Scene, World, sample_scene
+from dynmap_rl.envs.world import CONTROL_DT, VELOCITY_LIMIT
+
+DYNAMICS = ("position", "velocity", "acceleration")
+
+
+def plan_of(row: dict) -> Plan:
+    pushes = tuple(tuple(span) for span in row["pushes"])
+    return Plan(row["scene_seed"], row["checkpoint"], row["noise"], row["detours"], pushes)
+
+
+def files(root) -> dict[str, bytes]:
+    return {str(p.relative_to(root)): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
+
+
+def test_round_trip_is_exact(recording):
+    episodes, rows = load_dataset(recording), load_meta(recording)["episodes"]
+    assert episodes.shape == (6, 120)
+    for shard in (slice(0, 2), slice(2, 4), slice(4, 6)):
+        truth = roll_out("balance_reaching", [plan_of(row) for row in rows[shard]])
+        for key in ("pixels", "agent_pos", "goal", "action", *(("dynamics", k) for k in DYNAMICS)):
+            assert episodes[shard][key].dtype == truth[key].dtype
+            assert torch.equal(episodes[shard][key], truth[key]), key
+        for ours, theirs in (("reward", "reward"), ("done", "done"), ("success", "is_success")):
+            assert torch.equal(episodes[shard]["next", ours], truth["next", theirs])
+
+
+def test_replay_of_the_stored_actions_from_the_stored_scene(recording):
+    episodes, meta = load_dataset(recording), load_meta(recording)
+    for episode, row in zip(episodes, meta["episodes"], strict=True):
+        world = World(Scene.from_dict(row["scene"]))
+        for step in episode:
+            for name in DYNAMICS:
+                np.testing.assert_array_equal(
+                    step["dynamics", name].numpy(), getattr(world, name).astype(np.float32)
+                )
+            world.step(step["action"].numpy())
+        assert row["position_error"] == pytest.approx(world.position_error, abs=1e-6)
+
+
+def test_a_row_is_what_was_seen_before_its_action(recording):
+    episodes = load_dataset(recording).double()
+    position, velocity, acceleration = (episodes["dynamics", name] for name in DYNAMICS)
+    change = (velocity[:, 1:] - velocity[:, :-1]) / CONTROL_DT
+    torch.testing.assert_close(acceleration[:, 1:], change, atol=1e-4, rtol=0)
+    assert not acceleration[:, 0].any()
+    assert not velocity[:, 0].any()
+    moved = position[:, 1:, :3] - position[:, :-1, :3]
+    commanded = episodes["agent_pos"][..., :3]
+    torch.testing.assert_close(commanded[:, 1:] - commanded[:, :-1], episodes["action"][:, :-1], atol=1e-6, rtol=0)
+    # The cart moves by the mean of the last and the present commanded velocity: P_{t+1} follows a_t.
+    mean = (episodes["action"][:, :-1] + torch.cat([0 * moved[:, :1], episodes["action"][:, :-2]], 1)) / 2
+    torch.testing.assert_close(moved, mean, atol=2e-6, rtol=0)
+    off_by_one = (episodes["action"][:, 1:] + episodes["action"][:, :-1]) / 2
+    assert (moved - off_by_one).abs().max() > 1e-4
+
+
+def test_next_columns_come_after_the_action(recording):
+    after = load_dataset(recording)["next"]
+    assert after["done"][:, -1].all()
+    assert not after["done"][:, :-1].any()
+    assert after["success"][:, -1].all()
+    assert not after["success"][:, :-1].any()
+
+
+def test_metadata_tells_how_every_episode_was_made(recording):
+    meta = load_meta(recording)
+    assert (meta["format"], meta["task"], meta["kind"]) == (1, "balance_reaching", "demonstrations")
+    assert meta["splits"] == {"train": [0, 4], "eval": [4, 6]}
+    rows = meta["episodes"]
+    assert [row["episode_index"] for row in rows] == list(range(6))
+    assert [row["split"] for row in rows] == ["train"] * 4 + ["eval"] * 2
+    assert all(row["success"] and not row["dropped"] for row in rows)
+    for row in rows:
+        scene = sample_scene(np.random.default_rng(row["scene_seed"]))
+        assert json.loads(json.dumps(scene.to_dict())) == row["scene"]
+    seeds = {split: {r["scene_seed"] for r in rows if r["split"] == split} for split in ("train", "eval")}
+    assert len(seeds["train"]) == 4 and len(seeds["eval"]) == 2
+    assert max(seeds["train"]) < 100_000_000 <= min(seeds["eval"])
+    disturbed = load_dataset(recording)["disturbed"]
+    for row, marks in zip(rows, disturbed, strict=True):
+        steps = {t for start, end in row["pushes"] for t in range(start, end)}
+        assert set(marks.flatten().nonzero().flatten().tolist()) == steps
+
+
+def test_lerobot_reads_the_columns_and_splits(recording):
+    info = json.loads((recording / "meta" / "info.json").read_text())
+    assert info["splits"] == {"train": "0:4", "eval": "4:6"}
+    assert (info["fps"], info["robot_type"], info["total_episodes"]) == (20, "dynmap_cart", 6)
+    for name, feature in FEATURES.items():
+        stored = info["features"][name]
+        assert (stored["dtype"], tuple(stored["shape"]), stored["names"]) == tuple(feature.values())
+
+
+def test_statistics_are_those_of_float64(recording):
+    stats = json.loads((recording / "meta" / "stats.json").read_text())
+    episodes = load_dataset(recording).double()
+    for name, key in {"action": "action", "observation.state": "agent_pos"}.items() | {
+        (f"dynamics.{k}", ("dynamics", k)) for k in DYNAMICS
+    }:
+        values = episodes[key].flatten(0, 1).numpy()
+        np.testing.assert_allclose(stats[name]["mean"], values.mean(0), rtol=1e-10, atol=1e-12)
+        np.testing.assert_allclose(stats[name]["std"], values.std(0), rtol=1e-5, atol=1e-7)
+        np.testing.assert_allclose(stats[name]["min"], values.min(0))
+        np.testing.assert_allclose(stats[name]["max"], values.max(0))
+        width = values.max(0) - values.min(0)
+        assert (np.abs(stats[name]["q50"] - np.median(values, 0)) < 0.02 * width + 1e-9).all()
+    goals = episodes["goal"][:, 0]
+    assert stats["observation.state"]["q01"][3] < goals[:, 0].min() + 1e-3  # not the episodes' mean
+
+
+def test_statistics_of_the_episodes_are_those_of_float64(recording):
+    import pandas
+
+    table = pandas.concat(pandas.read_parquet(p) for p in (recording / "meta" / "episodes").rglob("*.parquet"))
+    goals = load_dataset(recording)["goal"][:, 0].numpy()
+    std = np.stack(table["stats/observation.state/std"])
+    assert (std[:, 3:] >= 0).all() and (std[:, 3:] < 1e-7).all()  # constant in an episode; float32 gives 1e-4
+    np.testing.assert_allclose(np.stack(table["stats/observation.state/mean"])[:, 3:], goals, rtol=1e-9)
+
+
+def test_normalization_is_natural_and_widens_only_where_needed(recording):
+    episodes = load_dataset(recording, "train")
+    stored = load_meta(recording)["normalization"]
+    assert stored == normalization_constants(episodes)
+    assert stored["goal"] == {"low": [0.0, 0.0], "high": [1.0, 1.0]}
+    assert stored["position"]["low"][:3] == [0.0, 0.0, -0.5]
+    np.testing.assert_allclose(stored["velocity"]["high"][:3], VELOCITY_LIMIT)
+    fast = episodes.clone()
+    fast["dynamics", "velocity"][..., 3] = -2.0
+    widened = normalization_constants(fast)["velocity"]
+    assert (widened["low"][3], widened["high"][3]) == (-2.0, 2.0)
+    assert widened["high"][:3] == stored["velocity"]["high"][:3]
+    still = episodes.apply(torch.zeros_like)
+    for constants in normalization_constants(still).values():
+        assert (np.array(constants["low"]) < np.array(constants["high"])).all()
+
+
+KILLED = """
+from dynmap_rl.data import record_dataset, recording
+if __name__ == "__main__":
+    recording.SHARD_EPISODES = 2
+    record_dataset({root!r}, episodes=4, eval_episodes=2, workers=2)
+"""
+
+
+def test_a_killed_recording_goes_on_to_the_same_dataset(recording, tmp_path, monkeypatch):
+    from dynmap_rl.data import recording as module
+
+    root, parts, script = tmp_path / "killed", tmp_path / "killed.parts", tmp_path / "record.py"
+    script.write_text(KILLED.format(root=str(root)))
+    process = subprocess.Popen([sys.executable, str(script)], stderr=subprocess.DEVNULL)
+    while not any(parts.glob("*_0000")) and process.poll() is None:
+        time.sleep(0.02)
+    workers = children(process.pid)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert len(workers) >= 2
+    wait_until_gone(workers)
+    assert not root.exists()
+    finished = [p for p in parts.iterdir() if p.is_dir() and not p.suffix]
+    assert 1 <= len(finished) <= 3
+    for shard in finished:
+        assert load_dataset(shard).shape == (2, 120)
+    before = {p.name: p.stat().st_ino for p in finished}
+    (parts / "train_0007.tmp").mkdir(exist_ok=True)
+    (parts / "train_0007.tmp" / "rest").write_text("of a shard")
+
+    kept = []
+    merge = module._merge
+    monkeypatch.setattr(
+        module, "_merge", lambda shards, *args: (kept.extend(s.folder for s in shards), merge(shards, *args))
+    )
+    inodes = {}
+    monkeypatch.setattr(module, "SHARD_EPISODES", 2)
+    original = module._run_shards
+    monkeypatch.setattr(
+        module, "_run_shards", lambda todo, workers: (inodes.update({s.folder.name for s in todo} and {}) or original(todo, workers))
+    )
+    assert record_dataset(root, episodes=4, eval_episodes=2, workers=1) == root
+    assert not parts.exists()
+    assert files(root) == files(recording)
