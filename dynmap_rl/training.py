@@ -20,7 +20,11 @@ STATES = ("latent", "hidden1", "hidden2")
 
 
 def train_world_model(
-    world_model: WorldModel, episodes: dict[str, TensorDictBase], folder: Path, settings, save_every: int = 250
+    world_model: WorldModel,
+    episodes: dict[str, TensorDictBase],
+    folder: Path,
+    settings,
+    save_every: int = 250,
 ) -> None:
     """Minimise Eq. 4a plus Eq. 5 on augmented windows; a stopped run goes on from its last training state.
 

@@ -34,19 +34,19 @@ class Config:
     # A world model that is trained already (a folder of another run); by default one is trained here.
     world_model: Path | None = None
     # World model: optimiser steps, windows a step, steps a window, decoded frames a window, peak learning rate.
-    updates: int = 4500
+    updates: int = 2500
     windows: int = 16
     window_steps: int = 24
-    rgb_steps: int = 6
-    learning_rate: float = 3e-3
+    rgb_steps: int = 8
+    learning_rate: float = 2e-3
     beta_z: float = 0.1
     beta_dynamics: float = 1.0
-    # Encoder with spatial-softmax keypoints beside the plain CNN's features.
-    keypoints: bool = True
+    # Spatial-softmax keypoints beside the plain CNN's features (beyond the paper).
+    keypoints: bool = False
     # Policy: optimiser steps, episodes a step, augmented copies of every demonstration, peak learning rate.
     policy_updates: int = 1500
     policy_batch: int = 32
-    copies: int = 4
+    copies: int = 2
     policy_learning_rate: float = 1e-3
     # Evaluation: scenes of the paper's protocol and of the shared start states.
     paper_episodes: int = 50
@@ -73,10 +73,13 @@ def main(config: Config) -> None:
         for name, value in SMOKE.items():
             setattr(config, name, value)
     supervision = parse_supervision(config.supervision)
+    modules.check_policy(config.policy)
     seeds = [int(seed) for seed in config.seeds.split(",")]
+    if config.dataset:
+        data.find_dataset(config.dataset)
+    trained = modules.load_world_model(config.world_model) if config.world_model else None
     name = f"{'_'.join(supervision) or 'none'}_{config.policy}{'_smoke' if config.smoke else ''}"
     folder = config.run or Path("runs/decoupled") / config.task / name
-    modules.check_policy(config.policy)
     folder = runs.open_run(folder, config, ignore=("run", "threads"))
     if (folder / "eval.json").exists():
         print(f"{folder} is done; delete it to run again")
@@ -87,9 +90,8 @@ def main(config: Config) -> None:
     constants = data.load_meta(dataset)["normalization"]
     episodes = {split: data.load_dataset(dataset, split) for split in ("train", "eval")}
 
-    if config.world_model:
-        world_model = modules.load_world_model(config.world_model)
-    else:
+    world_model = trained
+    if world_model is None:
         runs.seed_everything(config.world_model_seed)
         world_model = modules.make_world_model(constants, supervision, keypoints=config.keypoints)
         train_world_model(world_model, episodes, folder, config)
@@ -105,9 +107,7 @@ def main(config: Config) -> None:
 
     todo = [seed for seed in seeds if not (folder / f"seed_{seed}" / "eval.json").exists()]
     with concurrent.futures.ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
-        list(pool.map(train_and_evaluate, [(config, folder, constants, seed) for seed in todo]))
-    if fingerprint(modules.load_world_model(folder / "world_model")) != frozen:
-        raise ValueError("the frozen world model has changed; this run is not valid")
+        list(pool.map(train_and_evaluate, [(config, folder, constants, seed, frozen) for seed in todo]))
     result = write_report(folder, config, dataset, world_model, episodes["eval"], seeds, frozen)
     shutil.rmtree(folder / "features")
     print_row(result)
@@ -124,13 +124,13 @@ def record(config: Config) -> Path:
 
 def train_and_evaluate(arguments) -> None:
     """One policy seed, in a process of its own."""
-    config, folder, constants, seed = arguments
+    config, folder, constants, seed, frozen = arguments
     import torch
     from tensordict import TensorDict
 
     from dynmap_rl import modules, runs
     from dynmap_rl.evaluation import evaluate
-    from dynmap_rl.training import train_policy
+    from dynmap_rl.training import fingerprint, train_policy
 
     torch.set_num_threads(1)
     runs.seed_everything(1000 + seed)
@@ -140,6 +140,8 @@ def train_and_evaluate(arguments) -> None:
     held_out = TensorDict.load_memmap(folder / "features" / "eval")
     train_policy(policy, features, held_out, folder / f"seed_{seed}", config, seed)
     modules.save_policy(folder / f"seed_{seed}" / "policy", policy, world_model)
+    if fingerprint(world_model) != frozen:
+        raise ValueError("the frozen world model has changed; this run is not valid")
     result = evaluate(world_model, policy, config.task, config.test_episodes, config.paper_episodes)
     runs.write_json(folder / f"seed_{seed}" / "eval.json", result)
 

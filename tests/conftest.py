@@ -11,6 +11,10 @@ import torch
 torch.set_num_threads(1)
 
 
+def pytest_configure(config):
+    config.addinivalue_line("markers", "slow: starts processes of its own; leave out with -m 'not slow'")
+
+
 @pytest.fixture(scope="session")
 def recording(tmp_path_factory):
     """A dataset of 4 + 2 demonstrations, in three shards; not to be written to."""

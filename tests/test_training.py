@@ -33,7 +33,9 @@ def make_episodes(count=3, steps=12):
     generator = torch.Generator().manual_seed(0)
     return TensorDict(
         {
-            "pixels": torch.randint(0, 256, (count, steps, 3, 64, 64), dtype=torch.uint8, generator=generator),
+            "pixels": torch.randint(
+                0, 256, (count, steps, 3, 64, 64), dtype=torch.uint8, generator=generator
+            ),
             "action": 0.01 * torch.randn(count, steps, 3, generator=generator),
             "goal": torch.rand(count, steps, 2, generator=generator),
             "dynamics": {q: torch.rand(count, steps, 6, generator=generator) for q in DYNAMICS},

@@ -12,7 +12,6 @@ from dynmap_rl.envs import DynmapBatchedEnv, scene_seed
 from dynmap_rl.envs.world import EPISODE_STEPS
 from dynmap_rl.experts import list_checkpoints, load_expert
 
-
 PUSHES = 4  # in a disturbed demonstration
 PUSH_ACCELERATION = np.array([2.0, 2.0, 3.0])  # m/s^2, m/s^2, rad/s^2, the largest
 KEYS = [

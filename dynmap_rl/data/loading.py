@@ -182,11 +182,6 @@ def _episodes_and_steps(root: Path, table: pa.Table) -> tuple[int, int]:
     return len(lengths), int(lengths[0])
 
 
-def _episode_metadata(root: Path) -> list[dict]:
-    meta = read_json(root / META)
-    return meta if isinstance(meta, list) else meta["episodes"]  # a list in a shard
-
-
 def _read_column(root: Path, name: str, column: pa.ChunkedArray) -> torch.Tensor:
     """The column's numbers, one after the other, as memory of their own."""
     flat = column.combine_chunks()

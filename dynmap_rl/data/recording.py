@@ -192,7 +192,7 @@ def _run_shards(shards: list[Shard], workers: int):
                 future.result()
                 yield futures[future]
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
+            pool.shutdown(cancel_futures=True)
             raise
 
 

@@ -6,7 +6,6 @@ import dataclasses
 import sys
 from pathlib import Path
 
-import torch
 from tensordict import TensorDictBase
 
 from dynmap_rl.data import load_meta
@@ -33,7 +32,9 @@ def evaluate(
     return {name: {"summary": summarize(part), "rows": _columns(part)} for name, part in parts.items()}
 
 
-def write_report(folder: Path, settings, dataset, world_model, episodes: TensorDictBase, seeds, frozen) -> dict:
+def write_report(
+    folder: Path, settings, dataset, world_model, episodes: TensorDictBase, seeds, frozen
+) -> dict:
     """Collect the seeds' results into ``eval.json`` and draw the figures.
 
     Args:
@@ -58,7 +59,9 @@ def write_report(folder: Path, settings, dataset, world_model, episodes: TensorD
         "world_model_sha256": frozen,
         "paper_protocol": summarize_seeds([_rows(r["paper"]["rows"]) for r in results]),
         "test_protocol": summarize([row for rows in test for row in rows]),
-        "settings": {k: str(v) if isinstance(v, Path) else v for k, v in dataclasses.asdict(settings).items()},
+        "settings": {
+            k: str(v) if isinstance(v, Path) else v for k, v in dataclasses.asdict(settings).items()
+        },
         "command": " ".join(["python", *sys.argv]),
         "results": results,
     }
@@ -76,7 +79,9 @@ def print_row(result: dict) -> None:
     """The table row, beside the paper's."""
     ours, test = result["paper_protocol"], result["test_protocol"]
     low, high = test["SR_interval"]
-    print(f"\n{result['row']}, {result['policy']} policy, {result['task']}: drop rate, position error, success rate")
+    print(
+        f"\n{result['row']}, {result['policy']} policy, {result['task']}: drop rate, position error, success rate"
+    )
     print("  paper's protocol  " + _cells(ours["DR"], ours["PE"], ours["SR"]))
     paper = TABLE_1.get(result["policy"], {}).get(result["row"])
     if paper and result["task"] == "balance_reaching":

@@ -16,7 +16,7 @@ POLICIES = {"feedforward": FeedforwardPolicy, "recurrent": RecurrentPolicy}
 
 
 def make_world_model(
-    constants: dict, supervision: tuple[str, ...], latent_size=64, hidden_size=128, keypoints=True
+    constants: dict, supervision: tuple[str, ...], latent_size=64, hidden_size=128, keypoints=False
 ) -> WorldModel:
     """A fresh world model with a dataset's normalisation constants (``{name: {"low": [D], "high": [D]}}``)."""
     dynamics = {q: Normalizer(**constants[q]) for q in supervision}

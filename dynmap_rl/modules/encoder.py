@@ -23,7 +23,7 @@ class Encoder(nn.Module):
     """
 
     def __init__(
-        self, latent_size: int = 64, channels: tuple[int, int, int] = (16, 32, 64), keypoints: bool = True
+        self, latent_size: int = 64, channels: tuple[int, int, int] = (16, 32, 64), keypoints: bool = False
     ):
         super().__init__()
         c1, c2, c3 = channels
@@ -70,4 +70,3 @@ class SpatialSoftmax(nn.Module):
         across = torch.linspace(-1, 1, heat.shape[-1], device=heat.device)
         down = torch.linspace(-1, 1, heat.shape[-2], device=heat.device)
         return torch.cat([heat.sum(-2) @ across, heat.sum(-1) @ down], -1)
-

@@ -41,9 +41,7 @@ class Transition(nn.Module):
         predicted = latent + self.change(hidden2)
         return delay(predicted), delay(hidden1), delay(hidden2)
 
-    def step(
-        self, latent: torch.Tensor, action: torch.Tensor, state: State
-    ) -> tuple[torch.Tensor, State]:
+    def step(self, latent: torch.Tensor, action: torch.Tensor, state: State) -> tuple[torch.Tensor, State]:
         """Step form: ``z_t`` ``[B, Z]``, ``a_t`` ``[B, A]`` and ``h_t`` to ``z_hat_{t+1}`` and ``h_{t+1}``."""
         state = self.lstm.step(torch.cat([latent, self.action.normalize(action)], -1), state)
         return latent + self.change(state[2]), state

@@ -30,7 +30,7 @@ class WorldModel(nn.Module):
         dynamics: Mapping[str, Normalizer],
         latent_size: int = 64,
         hidden_size: int = 128,
-        keypoints: bool = True,
+        keypoints: bool = False,
     ):
         super().__init__()
         self.latent_size, self.hidden_size, self.keypoints = latent_size, hidden_size, keypoints

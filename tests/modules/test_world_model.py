@@ -132,7 +132,10 @@ def test_checkpoints_are_complete(tmp_path):
     policy = make_policy(CONSTANTS, "recurrent", model, width=20)
     save_world_model(tmp_path / "model", model)
     save_policy(tmp_path / "policy", policy, model)
-    for saved, loaded in ((model, load_world_model(tmp_path / "model")), (policy, load_policy(tmp_path / "policy"))):
+    for saved, loaded in (
+        (model, load_world_model(tmp_path / "model")),
+        (policy, load_policy(tmp_path / "policy")),
+    ):
         assert type(saved) is type(loaded)
         for name, value in saved.state_dict().items():
             assert torch.equal(value, loaded.state_dict()[name]), name

@@ -53,7 +53,9 @@ def test_another_row_uses_the_same_dataset_and_the_trained_world_model(smoke):
     assert result.returncode == 0, result.stderr
     assert "recording" not in result.stderr
     other = folder / "runs/decoupled/balance_reaching/position_velocity_feedforward_smoke"
-    assert (other / "world_model/weights.safetensors").read_bytes() == (trained / "weights.safetensors").read_bytes()
+    assert (other / "world_model/weights.safetensors").read_bytes() == (
+        trained / "weights.safetensors"
+    ).read_bytes()
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,213 @@
+"""What is loaded is what LeRobot reads, and what cannot be loaded is named."""
+
+import json
+import shutil
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import torch
+
+from dynmap_rl.data import load_dataset, load_meta
+from dynmap_rl.data.loading import CAMERA, NEEDED, OPTIONAL
+
+
+def test_equals_what_lerobot_reads(recording):
+    from lerobot.datasets import LeRobotDataset
+
+    from dynmap_rl.data.writing import quiet
+
+    with quiet():
+        dataset = LeRobotDataset("local/recording", root=recording, video_backend="pyav")
+    frames = load_dataset(recording).flatten(0, 1)
+    assert len(dataset) == len(frames) == 6 * 120
+    for i in (0, 1, 119, 120, 300, 719):
+        item, frame = dataset[i], frames[i]
+        assert torch.equal(item[CAMERA], frame["pixels"].float() / 255)
+        for key, name in (NEEDED | OPTIONAL).items():
+            assert item[name].dtype == frame[key].dtype
+            assert torch.equal(item[name].reshape(-1), frame[key]), name
+        assert item["task"].startswith("Carry the free-standing block")
+
+
+def test_shapes_and_types(recording):
+    episodes = load_dataset(recording)
+    expected = {
+        "pixels": ((6, 120, 3, 64, 64), torch.uint8),
+        "agent_pos": ((6, 120, 5), torch.float32),
+        "goal": ((6, 120, 2), torch.float32),
+        "action": ((6, 120, 3), torch.float32),
+        **{("dynamics", k): ((6, 120, 6), torch.float32) for k in ("position", "velocity", "acceleration")},
+        ("next", "reward"): ((6, 120, 1), torch.float32),
+        ("next", "done"): ((6, 120, 1), torch.bool),
+        ("next", "success"): ((6, 120, 1), torch.bool),
+    }
+    for key, (shape, dtype) in expected.items():
+        assert (tuple(episodes[key].shape), episodes[key].dtype) == (shape, dtype), key
+        assert episodes[key].is_contiguous()
+    assert torch.equal(episodes["goal"], episodes["agent_pos"][..., 3:])
+
+
+def test_splits_are_the_parts_of_the_whole(recording):
+    whole = load_dataset(str(recording))
+    train, evaluation = load_dataset(recording, "train"), load_dataset(recording, "eval")
+    assert (train.shape[0], evaluation.shape[0]) == (4, 2)
+    for key in whole.keys(True, True):
+        assert torch.equal(torch.cat([train[key], evaluation[key]]), whole[key])
+    with pytest.raises(ValueError, match=r"no split 'test'; choose from \['eval', 'train'\]"):
+        load_dataset(recording, "test")
+
+
+def test_colours_are_in_the_order_red_green_blue(recording):
+    episodes, rows = load_dataset(recording), load_meta(recording)["episodes"]
+    for episode, row in zip(episodes, rows, strict=True):
+        assert episode["pixels"][0, :, 0, 0].tolist() == row["scene"]["background_color"]
+
+
+@pytest.fixture
+def copy(recording, tmp_path):
+    return shutil.copytree(recording, tmp_path / "copy")
+
+
+def rewrite(root, change):
+    """Apply a function to the tables of the data files."""
+    for path in (root / "data").rglob("*.parquet"):
+        pq.write_table(change(pq.read_table(path)), path)
+
+
+def change_info(root, change):
+    path = root / "meta" / "info.json"
+    info = json.loads(path.read_text())
+    change(info)
+    path.write_text(json.dumps(info))
+
+
+def replace_column(table, name, values):
+    return table.set_column(table.column_names.index(name), name, values)
+
+
+def not_lerobot(root):
+    shutil.rmtree(root / "meta")
+
+
+def broken_json(root):
+    (root / "meta" / "info.json").write_text("{")
+
+
+def old_version(root):
+    change_info(root, lambda info: info.update(codebase_version="v2.1"))
+
+
+def no_dynamics(root):
+    change_info(root, lambda info: info["features"].pop("dynamics.velocity"))
+
+
+def video(root):
+    change_info(root, lambda info: info["features"][CAMERA].update(dtype="video"))
+
+
+def other_size(root):
+    change_info(root, lambda info: info["features"][CAMERA].update(shape=[96, 96, 3]))
+
+
+def truncated(root):
+    path = next((root / "data").rglob("*.parquet"))
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+def missing_file(root):
+    next((root / "data").rglob("*.parquet")).unlink()
+
+
+def no_files(root):
+    shutil.rmtree(root / "data")
+
+
+def unequal_lengths(root):
+    rewrite(root, lambda table: table.slice(0, len(table) - 1))
+    change_info(root, lambda info: info.update(total_frames=info["total_frames"] - 3))
+
+
+def nan(root):
+    def change(table):
+        values = np.array(table["action"].to_pylist(), dtype=np.float32)
+        values[5, 1] = np.nan
+        return replace_column(table, "action", pa.array(values.tolist(), table.schema.field("action").type))
+
+    rewrite(root, change)
+
+
+def empty_row(root):
+    def change(table):
+        values = table["next.reward"].to_pylist()
+        values[7] = None
+        return replace_column(table, "next.reward", pa.array(values, pa.float32()))
+
+    rewrite(root, change)
+
+
+def broken_frame(root):
+    def change(table):
+        frames = table[CAMERA].to_pylist()
+        frames[3]["bytes"] = frames[3]["bytes"][:20]
+        return replace_column(table, CAMERA, pa.array(frames, table.schema.field(CAMERA).type))
+
+    rewrite(root, change)
+
+
+def small_frame(root):
+    import cv2
+
+    def change(table):
+        frames = table[CAMERA].to_pylist()
+        frames[3]["bytes"] = cv2.imencode(".png", np.zeros((32, 64, 3), np.uint8))[1].tobytes()
+        return replace_column(table, CAMERA, pa.array(frames, table.schema.field(CAMERA).type))
+
+    rewrite(root, change)
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (not_lerobot, "not a LeRobot dataset"),
+        (broken_json, "info.json cannot be read"),
+        (old_version, "format v2.1, not v3.0; convert"),
+        (no_dynamics, "lacks the columns dynamics.velocity; add"),
+        (video, "as video; record it as images"),
+        (other_size, r"frames of \(96, 96, 3\)"),
+        (truncated, "damaged or unfinished data file"),
+        (missing_file, "is incomplete"),
+        (no_files, "is incomplete: 0 of 720 frames"),
+        (unequal_lengths, "of 119 to 120 steps"),
+        (nan, "action that are missing or not finite"),
+        (empty_row, "next.reward that are missing or not finite"),
+        (broken_frame, "frame 3 cannot be decoded"),
+        (small_frame, r"frame 3 is \(32, 64, 3\)"),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_what_is_wrong_is_named_with_the_folder(copy, damage, message):
+    damage(copy)
+    with pytest.raises(ValueError, match=message) as caught:
+        load_dataset(copy)
+    assert str(copy) in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["missing", "datasets/missing", "someone/missing", "./a/b", "/tmp/a/b/c"])
+def test_a_missing_dataset_is_named_and_not_created(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=f"no dataset at {name}.*recipes/collect.py"):
+        load_dataset(name)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_dataset_of_others_has_no_metadata_but_can_be_loaded(copy):
+    (copy / "meta" / "dynmap.json").unlink()
+    for name in ("reward", "done", "success"):
+        change_info(copy, lambda info, name=name: info["features"].pop(f"next.{name}"))
+    with pytest.raises(ValueError, match="has no meta/dynmap.json"):
+        load_meta(copy)
+    episodes = load_dataset(copy)
+    assert "next" not in episodes.keys()
+    assert not episodes["disturbed"].any()

@@ -1,0 +1,57 @@
+"""The collect recipe: records, says that it is done, and answers mistakes with one line."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from dynmap_rl.data import load_dataset
+from recipes.collect import Config, main
+
+RECIPE = Path(__file__).parents[2] / "recipes" / "collect.py"
+
+
+def run(folder, *arguments):
+    command = [sys.executable, str(RECIPE), *arguments]
+    return subprocess.run(command, cwd=folder, env=os.environ, capture_output=True, text=True)
+
+
+def test_records_where_it_says_and_then_says_that_it_is_complete(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    config = Config(kind="exploration", episodes=1, eval_episodes=1, workers=1)
+    main(config)
+    assert capsys.readouterr().out == "done: datasets/balance_reaching_exploration\n"
+    assert load_dataset("datasets/balance_reaching_exploration").shape == (2, 120)
+    assert [p.name for p in (tmp_path / "datasets").iterdir()] == ["balance_reaching_exploration"]
+    main(config)
+    assert capsys.readouterr().out == "complete already: datasets/balance_reaching_exploration\n"
+
+
+def test_pushes_what_is_there_already(recording, monkeypatch, capsys):
+    pushed = []
+    monkeypatch.setattr("dynmap_rl.data.writing.push_dataset", lambda *arguments: pushed.append(arguments))
+    main(Config(output=recording, episodes=4, eval_episodes=2, push_to_hub="someone/demonstrations"))
+    assert pushed == [(recording, "someone/demonstrations")]
+    assert "pushed: someone/demonstrations" in capsys.readouterr().out
+
+
+def test_a_mistake_is_one_line(recording, tmp_path):
+    result = run(tmp_path, "--output", str(recording))
+    assert result.returncode == 2
+    assert result.stderr.startswith(
+        f"error: {recording} holds another recording (episodes: 4 there, 300 here"
+    )
+    assert result.stderr.count("\n") == 1
+
+
+def test_help_imports_neither_torch_nor_lerobot(tmp_path):
+    code = (
+        "import runpy, sys\n"
+        f"sys.argv = [{str(RECIPE)!r}, '--help']\n"
+        "try: runpy.run_path(sys.argv[0], run_name='__main__')\n"
+        "except SystemExit: pass\n"
+        "print([m for m in ('torch', 'lerobot', 'datasets') if m in sys.modules])"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=os.environ)
+    assert "--push_to_hub" in result.stdout
+    assert result.stdout.endswith("[]\n")
