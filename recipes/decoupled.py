@@ -58,7 +58,7 @@ class Config:
 
 SMOKE = {
     "updates": 4, "windows": 2, "window_steps": 6, "rgb_steps": 2, "policy_updates": 3, "policy_batch": 2,
-    "copies": 1, "paper_episodes": 2, "test_episodes": 3, "seeds": "0,1",
+    "copies": 1, "paper_episodes": 2, "test_episodes": 3, "seeds": "0",
 }  # fmt: skip
 
 
@@ -71,7 +71,8 @@ def main(config: Config) -> None:
 
     if config.smoke:
         for name, value in SMOKE.items():
-            setattr(config, name, value)
+            if getattr(config, name) == getattr(Config, name):  # what was asked for stays
+                setattr(config, name, value)
     supervision = parse_supervision(config.supervision)
     modules.check_policy(config.policy)
     seeds = [int(seed) for seed in config.seeds.split(",")]
@@ -106,8 +107,13 @@ def main(config: Config) -> None:
     held_out.memmap(folder / "features" / "eval")
 
     todo = [seed for seed in seeds if not (folder / f"seed_{seed}" / "eval.json").exists()]
-    with concurrent.futures.ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
-        list(pool.map(train_and_evaluate, [(config, folder, constants, seed, frozen) for seed in todo]))
+    arguments = [(config, folder, constants, seed, frozen) for seed in todo]
+    if len(todo) > 1:
+        context = multiprocessing.get_context("spawn")
+        with concurrent.futures.ProcessPoolExecutor(2, mp_context=context) as pool:
+            list(pool.map(train_and_evaluate, arguments))
+    else:
+        list(map(train_and_evaluate, arguments))
     result = write_report(folder, config, dataset, world_model, episodes["eval"], seeds, frozen)
     shutil.rmtree(folder / "features")
     print_row(result)
@@ -118,7 +124,9 @@ def record(config: Config) -> Path:
     from dynmap_rl.data import record_dataset
 
     if config.smoke:
-        return record_dataset(f"datasets/{config.task}_smoke", config.task, episodes=4, eval_episodes=2)
+        return record_dataset(
+            f"datasets/{config.task}_smoke", config.task, episodes=4, eval_episodes=2, workers=1
+        )
     return record_dataset(f"datasets/{config.task}", config.task)
 
 

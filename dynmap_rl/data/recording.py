@@ -88,7 +88,7 @@ def record_dataset(
         raise ValueError(f"{root} is being recorded by another process; wait for it or stop it") from error
     except BrokenProcessPool as error:
         raise OSError(
-            f"a process that recorded {root} died; the same call goes on, with fewer workers"
+            f"a worker died while recording {root}; the same call goes on, try fewer workers"
         ) from error
     except OSError as error:
         raise OSError(
@@ -199,6 +199,7 @@ def _run_shards(shards: list[Shard], workers: int):
 def _start_worker() -> None:
     """End at once and without a word on Ctrl-C, and when the parent ends, even if it is killed."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    tqdm.set_lock(threading.RLock())  # its own is a semaphore, which Python would report as leaked
     parent = multiprocessing.parent_process()
     threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
 

@@ -75,6 +75,11 @@ def write_report(
     return result
 
 
+def read_rows(path: Path) -> list[list[dict]]:
+    """The rows on the shared start states of every policy seed of an ``eval.json``."""
+    return [_rows(result["test"]["rows"]) for result in read_json(path)["results"]]
+
+
 def print_row(result: dict) -> None:
     """The table row, beside the paper's."""
     ours, test = result["paper_protocol"], result["test_protocol"]
@@ -90,6 +95,25 @@ def print_row(result: dict) -> None:
         f"  {test['episodes']} episodes     DR {test['DR']:.1f} %   PE {test['PE']:.1f} mm   "
         f"SR {test['SR']:.1f} % [{low:.1f}, {high:.1f}]"
     )
+
+
+def markdown_row(result: dict) -> str:
+    """The row of the README's table: the paper's numbers, ours by its protocol, ours on the shared start states."""
+    ours, test = result["paper_protocol"], result["test_protocol"]
+    low, high = test["SR_interval"]
+    cells = [
+        f"{result['row']}, {result['policy']}",
+        _short(*TABLE_1[result["policy"]][result["row"]]),
+        _short(ours["DR"], ours["PE"], ours["SR"]),
+        f"{test['DR']:.1f}",
+        f"{test['PE']:.1f}",
+        f"**{test['SR']:.1f}** [{low:.1f}, {high:.1f}]",
+    ]
+    return f"| {' | '.join(cells)} |"
+
+
+def _short(drop, error, success) -> str:
+    return f"{success[0]:.0f} ({success[1]:.1f}); {drop[0]:.0f}, {error[0]:.0f}"
 
 
 def _cells(drop, error, success) -> str:

@@ -1,3 +1,4 @@
+import importlib.util
 import json
 import os
 import subprocess
@@ -23,6 +24,15 @@ def smoke(tmp_path_factory):
     return folder, result
 
 
+@pytest.fixture(scope="module")
+def recipe():
+    spec = importlib.util.spec_from_file_location("decoupled_recipe", ROOT / "recipes" / "decoupled.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["decoupled_recipe"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
 def test_smoke_run_leaves_everything_behind(smoke):
     folder, result = smoke
     run_folder = folder / "runs/decoupled/balance_reaching/position_velocity_recurrent_smoke"
@@ -31,54 +41,62 @@ def test_smoke_run_leaves_everything_behind(smoke):
     evaluation = json.loads((run_folder / "eval.json").read_text())
     assert evaluation["row"] == "RGB+[P+V]"
     assert evaluation["trained_on"]["episodes"] == 4
-    assert evaluation["test_protocol"]["episodes"] == 2 * 3
-    assert len(evaluation["results"]) == 2
+    assert evaluation["test_protocol"]["episodes"] == 3
     assert len(evaluation["results"][0]["test"]["rows"]["success"]) == 3
     for name in ("figures/reconstruction.png", "figures/dynamics.png", "rollouts.gif"):
         assert (run_folder / name).stat().st_size > 1000
     assert not (run_folder / "features").exists()
 
 
-def test_the_same_command_again_says_that_it_is_done(smoke):
+def test_the_same_command_again_says_that_it_is_done(smoke, recipe, monkeypatch, capsys):
     folder, first = smoke
-    again = run(folder, "--smoke")
-    assert "is done" in again.stdout
-    assert first.stdout.split("\n")[1] in again.stdout
+    monkeypatch.chdir(folder)
+    recipe.main(recipe.Config(smoke=True))
+    again = capsys.readouterr().out
+    assert "is done" in again
+    assert first.stdout.split("\n")[1] in again
 
 
-def test_another_row_uses_the_same_dataset_and_the_trained_world_model(smoke):
+def test_two_seeds_in_processes_on_a_world_model_that_is_there(smoke):
     folder, _ = smoke
-    trained = folder / "runs/decoupled/balance_reaching/position_velocity_recurrent_smoke/world_model"
-    result = run(folder, "--smoke", "--policy", "feedforward", "--seeds", "0", "--world_model", str(trained))
+    runs = folder / "runs/decoupled/balance_reaching"
+    trained = runs / "position_velocity_recurrent_smoke/world_model"
+    arguments = ["--policy", "feedforward", "--seeds", "0,1", "--world_model", str(trained)]
+    result = run(folder, "--smoke", *arguments)
     assert result.returncode == 0, result.stderr
     assert "recording" not in result.stderr
-    other = folder / "runs/decoupled/balance_reaching/position_velocity_feedforward_smoke"
-    assert (other / "world_model/weights.safetensors").read_bytes() == (
-        trained / "weights.safetensors"
-    ).read_bytes()
+    other = runs / "position_velocity_feedforward_smoke"
+    weights = "world_model/weights.safetensors"
+    assert (other / weights).read_bytes() == (trained.parent / weights).read_bytes()
+    policies = [(other / f"seed_{seed}/policy/weights.safetensors").read_bytes() for seed in (0, 1)]
+    assert policies[0] != policies[1]
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("settings", "message"),
     [
-        (["--supervision", "jerk"], "unknown supervision"),
-        (["--policy", "transformer"], "unknown policy"),
-        (["--dataset", "no/where/here"], "no dataset at no/where/here"),
-        (["--world_model", "nowhere"], "holds no checkpoint"),
-        (["--bogus", "1"], "unrecognized arguments"),
+        ({"supervision": "jerk"}, "unknown supervision"),
+        ({"policy": "transformer"}, "unknown policy"),
+        ({"dataset": "no/where/here"}, "no dataset at no/where/here"),
+        ({"world_model": Path("nowhere")}, "holds no checkpoint"),
     ],
 )
-def test_bad_input_gets_one_clear_line(smoke, arguments, message):
-    folder, _ = smoke
-    result = run(folder, "--smoke", "--run", "bad", *arguments)
+def test_bad_input_is_refused_before_anything_is_written(recipe, tmp_path, settings, message):
+    with pytest.raises(ValueError, match=message):
+        recipe.main(recipe.Config(smoke=True, run=tmp_path / "bad", **settings))
+    assert not (tmp_path / "bad").exists()
+
+
+def test_an_unknown_option_gets_one_clear_line(tmp_path):
+    result = run(tmp_path, "--bogus", "1")
     assert result.returncode == 2
-    assert message in result.stderr
+    assert "unrecognized arguments: --bogus" in result.stderr
     assert "Traceback" not in result.stderr
 
 
-def test_other_settings_on_the_same_folder_are_refused(smoke):
+def test_other_settings_on_the_same_folder_are_refused(smoke, recipe, monkeypatch):
     folder, _ = smoke
-    existing = "runs/decoupled/balance_reaching/position_velocity_recurrent_smoke"
-    result = run(folder, "--smoke", "--run", existing, "--beta_z", "3")
-    assert result.returncode == 2
-    assert "other settings (beta_z: 0.1 there, 3.0 here)" in result.stderr
+    monkeypatch.chdir(folder)
+    existing = Path("runs/decoupled/balance_reaching/position_velocity_recurrent_smoke")
+    with pytest.raises(ValueError, match=r"other settings \(beta_z: 0.1 there, 3.0 here\)"):
+        recipe.main(recipe.Config(smoke=True, run=existing, beta_z=3.0))

@@ -1,0 +1,52 @@
+"""What the README says: its snippets run, and its numbers are those of the results in the repository."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from dynmap_rl.evaluation import success_gap
+from dynmap_rl.evaluation.report import markdown_row, read_rows
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
+RESULTS = sorted((ROOT / "recipes" / "results").glob("decoupled_*.json"))
+
+
+def test_python_snippets_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    namespace = {}
+    snippets = re.findall(r"```python\n(.*?)```", README, re.S)
+    assert len(snippets) >= 4
+    for snippet in snippets:
+        exec(compile(snippet, "README", "exec"), namespace)
+    assert namespace["episodes"].shape == (4, 120)
+    assert namespace["losses"]["loss_rgb"] > 0
+
+
+@pytest.mark.parametrize("path", RESULTS, ids=lambda path: path.stem)
+def test_table_rows_are_those_of_the_results(path):
+    assert markdown_row(json.loads(path.read_text())) in README
+
+
+@pytest.mark.parametrize("policy", ["feedforward", "recurrent"])
+def test_gaps_are_those_of_the_results(policy):
+    with_dynamics, without = (
+        read_rows(ROOT / "recipes/results" / f"decoupled_balance_reaching_{name}_{policy}.json")
+        for name in ("position_velocity", "none")
+    )
+    gap = success_gap(with_dynamics, without)
+    low, high = gap["interval"]
+    assert f"{policy} {gap['gap']:.1f} points [{low:.1f}, {high:.1f}]" in README
+
+
+def test_every_option_and_file_that_the_readme_names_exists():
+    for path in re.findall(r"(?:recipes|dynmap_rl|tests)/[\w/]+\.(?:py|json|png|gif)", README):
+        assert (ROOT / path).exists(), path
+    options = set(re.findall(r"--(\w+)", " ".join(re.findall(r"```bash\n(.*?)```", README, re.S))))
+    known = "".join(
+        (ROOT / "recipes" / f"{name}.py").read_text() for name in ("decoupled", "collect", "expert")
+    )
+    for option in options:
+        assert re.search(rf"^    {option}: ", known, re.M), option
