@@ -78,6 +78,8 @@ def record_dataset(
     settings = {"task": task, "kind": kind, "episodes": episodes, "eval_episodes": eval_episodes}
     _check_settings(root, settings)
     parts = root.with_name(f"{root.name}.parts")
+    if (root / META).exists() and not parts.exists():
+        return root
     try:
         parts.mkdir(parents=True, exist_ok=True)
         with FileLock(parts / ".lock", timeout=0):
