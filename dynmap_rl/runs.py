@@ -10,9 +10,12 @@ import argparse
 import dataclasses
 import json
 import math
+import multiprocessing
 import os
 import random
+import signal
 import sys
+import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -60,7 +63,9 @@ def open_run(folder: Path, config, *, ignore: tuple[str, ...] = ()) -> Path:
         }
         if changed:
             detail = ", ".join(f"{k}: {old} there, {new} here" for k, (old, new) in sorted(changed.items()))
-            raise ValueError(f"{folder} holds a run with other settings ({detail}); choose another --run")
+            raise ValueError(
+                f"{folder} holds a run with other settings ({detail}); choose another --run, or delete it"
+            )
     else:
         write_json(path, settings)
     return folder
@@ -166,6 +171,16 @@ def seed_everything(seed: int) -> None:
     random.seed(seed)
     np.random.seed(seed % 2**32)
     torch.manual_seed(seed)
+
+
+def start_worker() -> None:
+    """End at once and without a word on Ctrl-C, and when the parent ends, even if it is killed."""
+    from tqdm import tqdm
+
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    tqdm.set_lock(threading.RLock())  # its own is a semaphore, which Python would report as leaked
+    parent = multiprocessing.parent_process()
+    threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
 
 
 def run_recipe(main, config_class) -> None:

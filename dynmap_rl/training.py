@@ -52,7 +52,7 @@ def train_world_model(
         optimizer.load_state_dict(state["optimizer"])
         generator.set_state(state["generator"])
         start = state["update"]
-        runs.truncate_metrics(folder, start)
+    runs.truncate_metrics(folder, start)
     progress = tqdm(range(start, settings.updates), "world model", settings.updates, initial=start)
     for update in progress:
         set_learning_rate(optimizer, settings.learning_rate, update, settings.updates)

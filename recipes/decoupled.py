@@ -7,13 +7,14 @@ With no option it records the demonstrations with the shipped expert first. The 
 goes on where it was stopped, or says that it is done.
 """
 
-import concurrent.futures
 import multiprocessing
 import shutil
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynmap_rl.runs import run_recipe
+from dynmap_rl.runs import run_recipe, start_worker
 
 
 @dataclass
@@ -48,7 +49,9 @@ class Config:
     policy_batch: int = 32
     copies: int = 2
     policy_learning_rate: float = 1e-3
-    # Evaluation: scenes of the paper's protocol and of the shared start states.
+    # Evaluation: scenes of the paper's protocol, shared start states, and the split they are of: test, or validation
+    # for choosing settings.
+    split: str = "test"
     paper_episodes: int = 50
     test_episodes: int = 1000
     # Every stage in a minimal size, for tests.
@@ -74,11 +77,10 @@ def main(config: Config) -> None:
             if getattr(config, name) == getattr(Config, name):  # what was asked for stays
                 setattr(config, name, value)
     supervision = parse_supervision(config.supervision)
-    modules.check_policy(config.policy)
-    seeds = [int(seed) for seed in config.seeds.split(",")]
-    if config.dataset:
-        data.find_dataset(config.dataset)
+    seeds = check(config)
     trained = modules.load_world_model(config.world_model) if config.world_model else None
+    if trained is not None and trained.supervision != supervision:
+        raise ValueError(f"{config.world_model} is supervised on {trained.supervision}, not on {supervision}")
     name = f"{'_'.join(supervision) or 'none'}_{config.policy}{'_smoke' if config.smoke else ''}"
     folder = config.run or Path("runs/decoupled") / config.task / name
     folder = runs.open_run(folder, config, ignore=("run", "threads"))
@@ -107,17 +109,36 @@ def main(config: Config) -> None:
     held_out.memmap(folder / "features" / "eval")
 
     todo = [seed for seed in seeds if not (folder / f"seed_{seed}" / "eval.json").exists()]
-    arguments = [(config, folder, constants, seed, frozen) for seed in todo]
-    if len(todo) > 1:
-        context = multiprocessing.get_context("spawn")
-        with concurrent.futures.ProcessPoolExecutor(2, mp_context=context) as pool:
-            list(pool.map(train_and_evaluate, arguments))
-    else:
-        list(map(train_and_evaluate, arguments))
-    result = write_report(folder, config, dataset, world_model, episodes["eval"], seeds, frozen)
+    run_seeds([(config, folder, constants, seed, frozen) for seed in todo])
     shutil.rmtree(folder / "features")
+    if fingerprint(modules.load_world_model(folder / "world_model")) != frozen:
+        raise ValueError(f"the frozen world model of {folder} has changed; delete the folder and run again")
+    result = write_report(folder, config, dataset, world_model, episodes["eval"], seeds, frozen)
     print_row(result)
     print(f"figures, rollouts and eval.json are in {folder}")
+
+
+def check(config: Config) -> list[int]:
+    """Refuse what cannot run, before anything is written; returns the policy seeds."""
+    from dynmap_rl import data, modules
+    from dynmap_rl.envs.tasks import get_task
+    from dynmap_rl.envs.world import EPISODE_STEPS
+
+    get_task(config.task)
+    modules.check_policy(config.policy)
+    try:
+        seeds = [int(seed) for seed in config.seeds.split(",")]
+    except ValueError as error:
+        raise ValueError(f"--seeds are whole numbers such as 0,1,2, not {config.seeds!r}") from error
+    if len(set(seeds)) < len(seeds):
+        raise ValueError(f"--seeds {config.seeds} has one twice")
+    if not 2 <= config.window_steps <= EPISODE_STEPS:
+        raise ValueError(f"--window_steps must be 2 to {EPISODE_STEPS}, not {config.window_steps}")
+    if min(config.updates, config.policy_updates, config.test_episodes, config.paper_episodes) < 1:
+        raise ValueError("updates and episodes must be at least 1")
+    if config.dataset and (task := data.load_meta(config.dataset)["task"]) != config.task:
+        raise ValueError(f"{config.dataset} holds the task {task}, not {config.task}")
+    return seeds
 
 
 def record(config: Config) -> Path:
@@ -130,8 +151,20 @@ def record(config: Config) -> Path:
     return record_dataset(f"datasets/{config.task}", config.task)
 
 
+def run_seeds(arguments: list[tuple]) -> None:
+    """Two at a time, each in a process of its own; one alone in this one."""
+    if len(arguments) <= 1:
+        return list(map(train_and_evaluate, arguments))
+    context = multiprocessing.get_context("spawn")
+    try:
+        with ProcessPoolExecutor(2, mp_context=context, initializer=start_worker) as pool:
+            list(pool.map(train_and_evaluate, arguments))
+    except BrokenProcessPool as error:
+        raise OSError("a policy's process died (of memory?); the same command goes on") from error
+
+
 def train_and_evaluate(arguments) -> None:
-    """One policy seed, in a process of its own."""
+    """One policy seed: train, evaluate, and prove that the world model stayed as it was."""
     config, folder, constants, seed, frozen = arguments
     import torch
     from tensordict import TensorDict
@@ -148,9 +181,12 @@ def train_and_evaluate(arguments) -> None:
     held_out = TensorDict.load_memmap(folder / "features" / "eval")
     train_policy(policy, features, held_out, folder / f"seed_{seed}", config, seed)
     modules.save_policy(folder / f"seed_{seed}" / "policy", policy, world_model)
-    if fingerprint(world_model) != frozen:
+    result = evaluate(
+        world_model, policy, config.task, config.test_episodes, config.paper_episodes, config.split
+    )
+    result["world_model_sha256"] = fingerprint(world_model)
+    if result["world_model_sha256"] != frozen:
         raise ValueError("the frozen world model has changed; this run is not valid")
-    result = evaluate(world_model, policy, config.task, config.test_episodes, config.paper_episodes)
     runs.write_json(folder / f"seed_{seed}" / "eval.json", result)
 
 

@@ -30,7 +30,8 @@ def augment(windows: TensorDictBase, generator: torch.Generator, max_shift: int 
     """Mirror, shift and recolour windows ``[B, T]`` at random, each window in its own way.
 
     Each change is a symmetry of the scene: x -> 1 - x (and theta -> -theta), a shift by up to ``max_shift`` whole
-    pixels (the border is repeated), a permutation of the colour channels. Pixels, dynamics, action and goal follow.
+    pixels (the border is repeated), a permutation of the colour channels. Pixels, dynamics, action and goal follow;
+    ``agent_pos`` and ``state`` are left out.
     """
     batch = windows.shape[0]
     mirror = torch.rand(batch, generator=generator) < 0.5
@@ -41,7 +42,7 @@ def augment(windows: TensorDictBase, generator: torch.Generator, max_shift: int 
     offset = torch.zeros(batch, 1, 3)
     offset[:, 0, :2] = shift * METERS_PER_PIXEL
     offset[:, 0, 0] += mirror  # 1 - x
-    windows = windows.copy()
+    windows = windows.exclude("agent_pos", "state")  # they hold poses that are not changed with the rest
     windows["pixels"] = _transform_pixels(windows["pixels"], mirror, shift, channels)
     windows["action"] = windows["action"] * sign
     windows["goal"] = windows["goal"] * sign[..., :2] + offset[..., :2]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tqdm import tqdm
 
 from dynmap_rl.modules import WorldModel
 
@@ -32,7 +33,7 @@ def compute_features(
     """
     parts = []
     for copy in range(copies + 1):
-        for chunk in episodes.split(batch):
+        for chunk in tqdm(episodes.split(batch), f"states {copy + 1}/{copies + 1}", leave=False):
             if copy:
                 chunk = augment(chunk, generator)
             latent = world_model.encode(chunk["pixels"])

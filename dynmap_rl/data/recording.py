@@ -9,10 +9,7 @@ interruption nor on the number of workers.
 from __future__ import annotations
 
 import multiprocessing
-import os
 import shutil
-import signal
-import threading
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
@@ -26,7 +23,7 @@ from tqdm import tqdm
 from dynmap_rl.envs import SceneRanges
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.world import ACCELERATION_LIMIT, ACTION_LIMIT, EPISODE_STEPS, VELOCITY_LIMIT
-from dynmap_rl.runs import read_json, write_json
+from dynmap_rl.runs import read_json, start_worker, write_json
 
 from .demonstrations import Plan, plan_demonstrations, plan_exploration, roll_out
 from .loading import META, load_meta
@@ -187,7 +184,7 @@ def _run_shards(shards: list[Shard], workers: int):
             yield shard
         return
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=_start_worker) as pool:
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=start_worker) as pool:
         futures = {pool.submit(_record_shard, shard): shard for shard in shards}
         try:
             for future in as_completed(futures):
@@ -196,14 +193,6 @@ def _run_shards(shards: list[Shard], workers: int):
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
-
-
-def _start_worker() -> None:
-    """End at once and without a word on Ctrl-C, and when the parent ends, even if it is killed."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    tqdm.set_lock(threading.RLock())  # its own is a semaphore, which Python would report as leaked
-    parent = multiprocessing.parent_process()
-    threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
 
 
 def _record_shard(shard: Shard) -> None:

@@ -108,7 +108,7 @@ class DynmapBatchedEnv(EnvBase):
         return self._observe().update(self._flags())
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        actions = tensordict["action"].cpu().numpy()
+        actions = tensordict["action"].detach().cpu().numpy()
         for world, action in zip(self.worlds, actions, strict=True):
             if self.control == "position":
                 world.step(action)

@@ -17,16 +17,27 @@ from .paper import TABLE_1, row_name
 from .rollout import episode_rows, roll_out, scene_seeds
 from .statistics import summarize, summarize_seeds
 
-PAPER_START = 1000  # the paper's protocol uses other test scenes than the shared start states
+PAPER_START = 1000  # the paper's protocol uses other scenes than the shared start states
 
 
 def evaluate(
-    world_model: WorldModel, policy, task: str, test_episodes: int = 1000, paper_episodes: int = 50
+    world_model: WorldModel,
+    policy,
+    task: str,
+    test_episodes: int = 1000,
+    paper_episodes: int = 50,
+    split: str = "test",
 ) -> dict[str, dict]:
     """One policy by both protocols: rows and summary on ``test_episodes`` shared start states (``test``) and on
-    ``paper_episodes`` others (``paper``). All episodes run as one batch."""
-    seeds = scene_seeds("test", test_episodes)
-    seeds += scene_seeds("test", paper_episodes, start=PAPER_START)
+    ``paper_episodes`` others (``paper``) of a split of the scenes. All episodes run as one batch.
+
+    Raises:
+        ValueError: more than 1,000 shared start states, which are all there are.
+    """
+    if test_episodes > PAPER_START:
+        raise ValueError(f"there are {PAPER_START} shared start states, not {test_episodes}")
+    seeds = scene_seeds(split, test_episodes)
+    seeds += scene_seeds(split, paper_episodes, start=PAPER_START)
     rows = episode_rows(roll_out(Actor(world_model, policy), task, seeds), seeds)
     parts = {"test": rows[:test_episodes], "paper": rows[test_episodes:]}
     return {name: {"summary": summarize(part), "rows": _columns(part)} for name, part in parts.items()}
@@ -49,6 +60,8 @@ def write_report(
 
     meta = load_meta(dataset)
     results = [read_json(folder / f"seed_{seed}" / "eval.json") for seed in seeds]
+    if any(r["world_model_sha256"] != frozen for r in results):
+        raise ValueError(f"seeds in {folder} belong to another world model; delete the folder and run again")
     test = [_rows(r["test"]["rows"]) for r in results]
     result = {
         "row": row_name(world_model.supervision),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import step_mdp
+from tqdm import tqdm
 
 from dynmap_rl.envs import DynmapBatchedEnv, scene_seed
 from dynmap_rl.envs.world import EPISODE_STEPS
@@ -33,7 +34,7 @@ def roll_out(actor: Actor, task: str, seeds: list[int], keep_pixels: bool = Fals
     keys += ["pixels"] if keep_pixels else []
     steps = []
     predicted = {q: torch.zeros(len(seeds), 6) for q in actor.world_model.supervision}
-    for _ in range(EPISODE_STEPS):
+    for _ in tqdm(range(EPISODE_STEPS), f"{len(seeds)} episodes", unit="step", leave=False):
         td = env.step(actor(td))
         step = td.select(*keys)
         step["predicted_dynamics"] = TensorDict(predicted, [len(seeds)])
@@ -46,7 +47,8 @@ def roll_out(actor: Actor, task: str, seeds: list[int], keep_pixels: bool = Fals
 
 def episode_rows(episodes: TensorDict, seeds: list[int]) -> list[dict]:
     """One JSON-ready row an episode: scene seed, dropped, position error (m), success, and, where the world model
-    decodes positions, the mean distance between predicted and true cart position (m)."""
+    decodes positions, the mean distance between predicted and true cart position (m), in all steps and in those
+    more than 0.1 m away from the goal."""
     last = episodes["next"][:, -1]
     rows = [
         {
@@ -59,7 +61,10 @@ def episode_rows(episodes: TensorDict, seeds: list[int]) -> list[dict]:
     ]
     if "position" in episodes["predicted_dynamics"].keys():
         error = episodes["predicted_dynamics", "position"] - episodes["dynamics", "position"]
-        error = error[:, 1:, :2].norm(dim=-1).mean(1)
-        for row, value in zip(rows, error.tolist(), strict=True):
+        error = error[:, 1:, :2].norm(dim=-1)  # [E, T - 1]
+        away = (episodes["dynamics", "position"][..., :2] - episodes["goal"])[:, 1:].norm(dim=-1) > 0.1
+        away_error = (error * away).sum(1) / away.sum(1).clamp(min=1)
+        for row, value, value_away in zip(rows, error.mean(1).tolist(), away_error.tolist(), strict=True):
             row["localization_error"] = round(value, 5)
+            row["localization_error_away"] = round(value_away, 5)
     return rows

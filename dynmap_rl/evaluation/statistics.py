@@ -21,6 +21,7 @@ def summarize(rows: list[dict]) -> dict[str, float]:
     }
     if "localization_error" in rows[0]:
         summary["localization"] = 1000 * float(np.mean([row["localization_error"] for row in rows]))
+        summary["localization_away"] = 1000 * float(np.mean([row["localization_error_away"] for row in rows]))
     return summary
 
 

@@ -54,6 +54,8 @@ def save_world_model(folder: Path, model: WorldModel) -> None:
 def load_world_model(folder: Path) -> WorldModel:
     """Raises ``ValueError`` where the folder holds no world model."""
     arguments = _read_arguments(folder)
+    if "dynamics" not in arguments:
+        raise ValueError(f"{folder} holds a policy, not a world model")
     arguments["action"] = _blank(arguments["action"])
     arguments["dynamics"] = {q: _blank(size) for q, size in arguments["dynamics"].items()}
     model = WorldModel(**arguments)
@@ -78,6 +80,8 @@ def save_policy(folder: Path, policy: FeedforwardPolicy | RecurrentPolicy, world
 def load_policy(folder: Path) -> FeedforwardPolicy | RecurrentPolicy:
     """Raises ``ValueError`` where the folder holds no policy."""
     arguments = _read_arguments(folder)
+    if "kind" not in arguments:
+        raise ValueError(f"{folder} holds a world model, not a policy")
     kind = POLICIES[arguments.pop("kind")]
     arguments |= {"action": _blank(arguments["action"]), "goal": _blank(arguments["goal"])}
     policy = kind(**arguments)

@@ -79,12 +79,28 @@ def test_two_seeds_in_processes_on_a_world_model_that_is_there(smoke):
         ({"policy": "transformer"}, "unknown policy"),
         ({"dataset": "no/where/here"}, "no dataset at no/where/here"),
         ({"world_model": Path("nowhere")}, "holds no checkpoint"),
+        ({"task": "juggling"}, "unknown task"),
+        ({"seeds": "0,0"}, "has one twice"),
+        ({"seeds": "a"}, "whole numbers"),
+        ({"window_steps": 500}, "window_steps must be"),
+        ({"test_episodes": 0}, "at least 1"),
     ],
 )
 def test_bad_input_is_refused_before_anything_is_written(recipe, tmp_path, settings, message):
     with pytest.raises(ValueError, match=message):
-        recipe.main(recipe.Config(smoke=True, run=tmp_path / "bad", **settings))
+        recipe.main(recipe.Config(run=tmp_path / "bad", **settings))
     assert not (tmp_path / "bad").exists()
+
+
+def test_a_world_model_of_another_row_is_refused(smoke, recipe, tmp_path):
+    folder, _ = smoke
+    trained = folder / "runs/decoupled/balance_reaching/position_velocity_recurrent_smoke"
+    for path, message in (
+        (trained / "world_model", "is supervised on"),
+        (trained / "seed_0/policy", "a policy"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            recipe.main(recipe.Config(smoke=True, supervision="none", world_model=path, run=tmp_path / "bad"))
 
 
 def test_an_unknown_option_gets_one_clear_line(tmp_path):
