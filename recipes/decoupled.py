@@ -123,6 +123,7 @@ def check(config: Config) -> list[int]:
     from dynmap_rl import data, modules
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.envs.world import EPISODE_STEPS
+    from dynmap_rl.evaluation import SHARED_STARTS
 
     get_task(config.task)
     modules.check_policy(config.policy)
@@ -134,6 +135,10 @@ def check(config: Config) -> list[int]:
         raise ValueError(f"--seeds {config.seeds} has one twice")
     if not 2 <= config.window_steps <= EPISODE_STEPS:
         raise ValueError(f"--window_steps must be 2 to {EPISODE_STEPS}, not {config.window_steps}")
+    if config.split not in ("test", "validation"):
+        raise ValueError(f"--split is test or validation, not {config.split!r}")
+    if config.test_episodes > SHARED_STARTS:
+        raise ValueError(f"there are {SHARED_STARTS} shared start states, not {config.test_episodes}")
     if min(config.updates, config.policy_updates, config.test_episodes, config.paper_episodes) < 1:
         raise ValueError("updates and episodes must be at least 1")
     if config.dataset and (task := data.load_meta(config.dataset)["task"]) != config.task:

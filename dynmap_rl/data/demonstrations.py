@@ -84,8 +84,8 @@ def roll_out(task: str, plans: list[Plan]) -> TensorDict:
         apart = 2 * (goal - td["dynamics", "position"][:, :2])
         state[:, :2] = torch.where(goal.isnan(), state[:, :2], apart)
         acceleration = _expert_acceleration(t, state, plans, networks, rngs)
-        action = np.stack([_to_action(w, a) for w, a in zip(env.worlds, acceleration, strict=True)])
-        td = env.step(td.set("action", torch.from_numpy(action)))
+        action = np.stack([w.action_for(a) for w, a in zip(env.worlds, acceleration, strict=True)])
+        td = env.step(td.set("action", torch.from_numpy(action.astype(np.float32))))
         executed = np.stack([w.action for w in env.worlds]).astype(np.float32)
         td["action"] = torch.from_numpy(executed)
         steps.append(td.select(*KEYS))
@@ -112,10 +112,6 @@ def _draw_pushes(scene_seed: int) -> tuple[tuple[int, int], ...]:
     rng = np.random.default_rng([scene_seed, 2])
     starts = np.sort(rng.integers(2, EPISODE_STEPS - 25, PUSHES))
     return tuple((int(t), int(t + rng.integers(2, 7))) for t in starts)
-
-
-def _to_action(world, acceleration: np.ndarray) -> np.ndarray:
-    return world.action_for(acceleration).astype(np.float32)
 
 
 def _detour_goals(plans: list[Plan], rngs) -> torch.Tensor:

@@ -33,7 +33,6 @@ class DynmapBatchedEnv(EnvBase):
         from_pixels: draw a frame a step.
         control: ``position`` or ``acceleration`` (see ``DynmapEnv``).
         ranges: what scenes are drawn from.
-        supersample: of the renderer.
         seed: of the scenes.
     """
 
@@ -46,7 +45,6 @@ class DynmapBatchedEnv(EnvBase):
         from_pixels: bool = False,
         control: str = "position",
         ranges: SceneRanges | None = None,
-        supersample: int = 1,
         seed: int | None = None,
         device: torch.device | str = "cpu",
     ):
@@ -58,7 +56,7 @@ class DynmapBatchedEnv(EnvBase):
         self.task = get_task(task)
         self.control = control
         self.ranges = ranges or SceneRanges()
-        self.renderer = Renderer(supersample=supersample) if from_pixels else None
+        self.renderer = Renderer() if from_pixels else None
         self.worlds: list[World | None] = [None] * num_envs
         self._make_specs()
         self.set_seed(seed)

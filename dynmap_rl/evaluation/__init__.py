@@ -1,11 +1,12 @@
 """Closed-loop rollouts, DR / PE / SR, statistics and figures."""
 
 from .paper import TABLE_1, parse_supervision, row_name
-from .report import evaluate, print_row, write_report
+from .report import SHARED_STARTS, evaluate, print_row, write_report
 from .rollout import episode_rows, roll_out, scene_seeds
 from .statistics import success_gap, summarize, summarize_seeds, wilson
 
 __all__ = [
+    "SHARED_STARTS",
     "TABLE_1",
     "episode_rows",
     "evaluate",

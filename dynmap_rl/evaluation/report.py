@@ -17,7 +17,7 @@ from .paper import TABLE_1, row_name
 from .rollout import episode_rows, roll_out, scene_seeds
 from .statistics import summarize, summarize_seeds
 
-PAPER_START = 1000  # the paper's protocol uses other scenes than the shared start states
+SHARED_STARTS = 1000  # the paper's protocol uses the scenes after these
 
 
 def evaluate(
@@ -34,10 +34,10 @@ def evaluate(
     Raises:
         ValueError: more than 1,000 shared start states, which are all there are.
     """
-    if test_episodes > PAPER_START:
-        raise ValueError(f"there are {PAPER_START} shared start states, not {test_episodes}")
+    if test_episodes > SHARED_STARTS:
+        raise ValueError(f"there are {SHARED_STARTS} shared start states, not {test_episodes}")
     seeds = scene_seeds(split, test_episodes)
-    seeds += scene_seeds(split, paper_episodes, start=PAPER_START)
+    seeds += scene_seeds(split, paper_episodes, start=SHARED_STARTS)
     rows = episode_rows(roll_out(Actor(world_model, policy), task, seeds), seeds)
     parts = {"test": rows[:test_episodes], "paper": rows[test_episodes:]}
     return {name: {"summary": summarize(part), "rows": _columns(part)} for name, part in parts.items()}

@@ -36,7 +36,7 @@ def random_actions(count: int, steps: int, control: str = "position") -> torch.T
         {},
         {"num_envs": 3},
         {"num_envs": 2, "from_pixels": True},
-        {"num_envs": 2, "from_pixels": True, "supersample": 2, "control": "acceleration"},
+        {"num_envs": 2, "from_pixels": True, "control": "acceleration"},
     ],
 )
 def test_specs(arguments):

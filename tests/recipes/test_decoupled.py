@@ -84,6 +84,8 @@ def test_two_seeds_in_processes_on_a_world_model_that_is_there(smoke):
         ({"seeds": "a"}, "whole numbers"),
         ({"window_steps": 500}, "window_steps must be"),
         ({"test_episodes": 0}, "at least 1"),
+        ({"test_episodes": 1001}, "1000 shared start states"),
+        ({"split": "train"}, "test or validation"),
     ],
 )
 def test_bad_input_is_refused_before_anything_is_written(recipe, tmp_path, settings, message):
