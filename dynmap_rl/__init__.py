@@ -18,8 +18,10 @@ def __getattr__(name: str):
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
-gymnasium.register(
-    id="dynmap_rl/BalanceReaching-v0",
-    entry_point="dynmap_rl.envs.gymnasium_env:DynmapEnv",
-    kwargs={"task": "balance_reaching"},
-)
+GYMNASIUM_IDS = {
+    "dynmap_rl/BalanceReaching-v0": "balance_reaching",
+    "dynmap_rl/BalanceReachingObstacle-v0": "balance_reaching_obstacle",
+    "dynmap_rl/BinDropping-v0": "bin_dropping",
+}
+for _id, _task in GYMNASIUM_IDS.items():
+    gymnasium.register(_id, "dynmap_rl.envs.gymnasium_env:DynmapEnv", kwargs={"task": _task})

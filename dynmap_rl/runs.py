@@ -71,6 +71,13 @@ def open_run(folder: Path, config, *, ignore: tuple[str, ...] = ()) -> Path:
     return folder
 
 
+def replace_defaults(config, values: dict) -> None:
+    """Set those fields of a dataclass that still have their default: what was asked for stays."""
+    for name, value in values.items():
+        if getattr(config, name) == getattr(type(config), name):
+            setattr(config, name, value)
+
+
 def append_metrics(folder: Path, step: int, **metrics: float) -> None:
     """Append one line to ``metrics.jsonl``."""
     line = json.dumps({"step": step, **{k: _plain(v) for k, v in metrics.items()}})
@@ -190,6 +197,7 @@ def run_recipe(main, config_class) -> None:
     """
     import draccus
 
+    sys.path.insert(0, os.getcwd())  # where the module of a task named module:Class may lie
     arguments = [a for a in sys.argv[1:] if a != "--debug"]
     debug = len(arguments) < len(sys.argv) - 1
     flags = {f"--{f.name}" for f in dataclasses.fields(config_class) if f.type in (bool, "bool")}

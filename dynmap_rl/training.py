@@ -12,7 +12,8 @@ from torch import nn
 from tqdm import tqdm
 
 from dynmap_rl import runs
-from dynmap_rl.data import augment, sample_windows
+from dynmap_rl.data import add_distractors, augment, sample_windows
+from dynmap_rl.envs.world import EPISODE_STEPS
 from dynmap_rl.modules import WorldModel
 from dynmap_rl.objectives import WorldModelLoss, imitation_loss
 
@@ -32,8 +33,8 @@ def train_world_model(
         world_model: changed in place.
         episodes: ``train`` and ``eval``, ``[E, T]``.
         folder: run folder; gets ``metrics.jsonl`` and the training state.
-        settings: with ``updates``, ``windows``, ``window_steps``, ``rgb_steps``, ``learning_rate``, ``beta_z``,
-            ``beta_dynamics`` and ``world_model_seed``.
+        settings: with ``updates``, ``windows``, ``window_steps``, ``rgb_steps``, ``distractors``,
+            ``learning_rate``, ``beta_z``, ``beta_dynamics`` and ``world_model_seed``.
 
     Raises:
         ValueError: a loss is not finite.
@@ -57,7 +58,7 @@ def train_world_model(
     for update in progress:
         set_learning_rate(optimizer, settings.learning_rate, update, settings.updates)
         windows = sample_windows(train, settings.windows, settings.window_steps, generator)
-        windows = augment(windows, generator)
+        windows = add_distractors(augment(windows, generator), generator, settings.distractors)
         with torch.autocast("cpu", torch.bfloat16):
             losses = loss_module(windows)
         step(sum(losses.values()), optimizer)
@@ -75,6 +76,14 @@ def train_world_model(
                 generator=generator.get_state(),
                 update=done,
             )
+
+
+def check_training(settings) -> None:
+    """Raises ``ValueError`` for settings of a world model's training that cannot run."""
+    if not 2 <= settings.window_steps <= EPISODE_STEPS:
+        raise ValueError(f"--window_steps must be 2 to {EPISODE_STEPS}, not {settings.window_steps}")
+    if settings.updates < 1:
+        raise ValueError(f"--updates must be at least 1, not {settings.updates}")
 
 
 def train_policy(

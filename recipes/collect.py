@@ -15,7 +15,7 @@ from dynmap_rl.runs import run_recipe
 
 @dataclass
 class Config:
-    # Name of the task.
+    # Name of the task: balance_reaching, balance_reaching_obstacle, bin_dropping, or module:Class of your own.
     task: str = "balance_reaching"
     # demonstrations (successful episodes only) or exploration (noisy experts on detours, all episodes).
     kind: str = "demonstrations"
@@ -24,6 +24,8 @@ class Config:
     eval_episodes: int = 50
     # Folder of the dataset; by default datasets/TASK, or datasets/TASK_exploration.
     output: Path | None = None
+    # Folder of the expert's checkpoints (of a run of recipes/expert.py); by default the one that ships for the task.
+    expert: Path | None = None
     # Processes that roll out and write.
     workers: int = 2
     # Id on the Hugging Face hub (user/name) to upload the dataset to.
@@ -33,11 +35,13 @@ class Config:
 def main(config: Config) -> None:
     from dynmap_rl.data import push_dataset, record_dataset
     from dynmap_rl.data.loading import META
+    from dynmap_rl.envs.tasks import get_task
 
     suffix = "" if config.kind == "demonstrations" else f"_{config.kind}"
-    output = config.output or Path("datasets") / f"{config.task}{suffix}"
+    output = config.output or Path("datasets") / f"{get_task(config.task).name}{suffix}"
     complete = (output / META).exists()
-    record_dataset(output, config.task, config.kind, config.episodes, config.eval_episodes, config.workers)
+    sizes = config.episodes, config.eval_episodes
+    record_dataset(output, config.task, config.kind, *sizes, config.workers, config.expert)
     print(f"{'complete already' if complete else 'done'}: {output}")
     if config.push_to_hub:
         push_dataset(output, config.push_to_hub)

@@ -15,7 +15,7 @@ from dynmap_rl.runs import run_recipe
 
 @dataclass
 class Config:
-    # Name of the task.
+    # Name of the task: balance_reaching, balance_reaching_obstacle, bin_dropping, or module:Class of your own.
     task: str = "balance_reaching"
     # Run folder; by default runs/expert/TASK.
     run: Path | None = None
@@ -56,7 +56,7 @@ def main(config: Config) -> None:
     torch.set_num_threads(config.threads)
     env = DynmapBatchedEnv(config.task, config.num_envs, control="acceleration")
     folder = runs.open_run(
-        config.run or Path("runs/expert") / config.task, config, ignore=("iterations", "threads")
+        config.run or Path("runs/expert") / env.task.name, config, ignore=("iterations", "threads")
     )
     runs.seed_everything(config.seed)
     state_size = env.task.state_size
@@ -116,7 +116,7 @@ def main(config: Config) -> None:
         last = iteration + 1 == config.iterations
         if last or (iteration + 1) % config.checkpoint_every == 0:
             episodes = config.final_episodes if last else config.eval_episodes
-            facts = evaluate(network, config.task, episodes)
+            facts = evaluate(network, env.task, episodes)
             facts |= {
                 "task": config.task,
                 "iteration": iteration + 1,
@@ -163,24 +163,16 @@ def update(batch, loss_module, advantage, optimizer, config: Config) -> dict[str
     return {k: losses[k].item() for k in ("loss_objective", "loss_critic", "entropy")}
 
 
-def evaluate(network, task: str, episodes: int) -> dict[str, float]:
+def evaluate(network, task, episodes: int) -> dict[str, float]:
     """Success and drop rate of the mean action on fresh scenes (the exploration split, never evaluated on)."""
-    import torch
-    from tensordict import TensorDict
+    from dynmap_rl.envs import scene_seed
+    from dynmap_rl.experts import roll_out
 
-    from dynmap_rl.envs import DynmapBatchedEnv, scene_seed
-    from dynmap_rl.envs.world import EPISODE_STEPS
-
-    env = DynmapBatchedEnv(task, episodes, control="acceleration")
-    seeds = torch.tensor([scene_seed("exploration", 10_000_000 + i) for i in range(episodes)])
-    td = env.reset(TensorDict({"scene_seed": seeds}, [episodes]))
-    with torch.no_grad():
-        for _ in range(EPISODE_STEPS):
-            td = env.step(td.set("action", network(td["state"])[0]))["next"]
+    worlds = roll_out(network, task, [scene_seed("exploration", 10_000_000 + i) for i in range(episodes)])
     return {
-        "success": td["is_success"].float().mean().item(),
-        "drop": td["dropped"].float().mean().item(),
-        "position_error": td["position_error"].mean().item(),
+        "success": sum(task.is_success(world) for world in worlds) / episodes,
+        "drop": sum(world.dropped for world in worlds) / episodes,
+        "position_error": sum(world.position_error for world in worlds) / episodes,
         "episodes": episodes,
     }
 

@@ -19,6 +19,7 @@ SETTINGS = SimpleNamespace(
     windows=2,
     window_steps=5,
     rgb_steps=2,
+    distractors=2,
     learning_rate=1e-3,
     beta_z=0.1,
     beta_dynamics=1.0,
@@ -95,10 +96,11 @@ def test_training_a_policy_leaves_the_world_model_as_it_was(tmp_path):
 def test_features_are_the_plain_episodes_first_then_the_copies():
     model = make_model().eval()
     episodes = make_episodes()
-    features = compute_features(model, episodes, copies=2, generator=torch.Generator().manual_seed(0))
+    features = compute_features(model, episodes, 2, torch.Generator().manual_seed(0), max_shift=6)
     assert features.shape == (9, 12)
-    assert torch.equal(features["action"][:3], episodes["action"])
+    assert torch.equal(features["action"], episodes["action"].repeat(3, 1, 1)), "copies are never mirrored"
     assert not torch.equal(features["goal"][3:6], episodes["goal"])
+    assert not torch.equal(features["latent"][3:6], features["latent"][:3])
     with torch.no_grad():
         torch.testing.assert_close(features["latent"][:3], model.encode(episodes["pixels"]))
 

@@ -3,6 +3,7 @@
 import importlib
 
 _MODULES = {
+    "add_distractors": "augmentation",
     "augment": "augmentation",
     "compute_features": "features",
     "find_dataset": "loading",

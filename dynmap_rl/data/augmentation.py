@@ -26,29 +26,68 @@ def sample_windows(
     return episodes[episode, start + torch.arange(length)]
 
 
-def augment(windows: TensorDictBase, generator: torch.Generator, max_shift: int = 6) -> TensorDictBase:
+def augment(
+    windows: TensorDictBase, generator: torch.Generator, max_shift: int = 6, mirror: bool = True
+) -> TensorDictBase:
     """Mirror, shift and recolour windows ``[B, T]`` at random, each window in its own way.
 
-    Each change is a symmetry of the scene: x -> 1 - x (and theta -> -theta), a shift by up to ``max_shift`` whole
-    pixels (the border is repeated), a permutation of the colour channels. Pixels, dynamics, action and goal follow;
+    Each change is a symmetry of the scene: x -> 1 - x (and theta -> -theta), unless ``mirror`` is false; a shift by
+    up to ``max_shift`` whole pixels (the border is repeated); a permutation of the colour channels. Pixels, dynamics, action and goal follow;
     ``agent_pos`` and ``state`` are left out.
     """
     batch = windows.shape[0]
-    mirror = torch.rand(batch, generator=generator) < 0.5
+    mirrored = (torch.rand(batch, generator=generator) < 0.5) & mirror
     shift = torch.randint(-max_shift, max_shift + 1, (batch, 2), generator=generator)
     channels = torch.stack([torch.randperm(3, generator=generator) for _ in range(batch)])
 
-    sign = torch.where(mirror[:, None, None], MIRROR, torch.ones(3))  # (B, 1, 3)
+    sign = torch.where(mirrored[:, None, None], MIRROR, torch.ones(3))  # (B, 1, 3)
     offset = torch.zeros(batch, 1, 3)
     offset[:, 0, :2] = shift * METERS_PER_PIXEL
-    offset[:, 0, 0] += mirror  # 1 - x
+    offset[:, 0, 0] += mirrored  # 1 - x
     windows = windows.exclude("agent_pos", "state")  # they hold poses that are not changed with the rest
-    windows["pixels"] = _transform_pixels(windows["pixels"], mirror, shift, channels)
+    windows["pixels"] = _transform_pixels(windows["pixels"], mirrored, shift, channels)
     windows["action"] = windows["action"] * sign
     windows["goal"] = windows["goal"] * sign[..., :2] + offset[..., :2]
     dynamics = windows["dynamics"].apply(lambda x: x * sign.repeat(1, 1, 2))
     windows["dynamics"] = dynamics.set("position", dynamics["position"] + offset.repeat(1, 1, 2))
     return windows
+
+
+def add_distractors(windows: TensorDictBase, generator: torch.Generator, most: int = 3) -> TensorDictBase:
+    """Paint up to ``most`` bars on the background of each window ``[B, T]``, at rest and of one vivid colour.
+
+    They lie behind all that is in the picture, and input and target get the same, so that a world model learns to
+    tell objects that it does not know from cart and block. Windows must be drawn on one background colour.
+    """
+    pixels = windows["pixels"].clone()
+    for window in pixels:
+        scene = _draw_bars(most, generator)
+        background = window[0].flatten(1).mode(1).values[:, None, None]
+        free = (window == background).all(1)  # (T, H, W)
+        window[:] = torch.where((free & scene).unsqueeze(1), _draw_color(generator), window)
+    return windows.clone(False).set("pixels", pixels)
+
+
+def _draw_bars(most: int, generator: torch.Generator, size: int = 64) -> torch.Tensor:
+    """A mask ``[size, size]`` of 0 to ``most`` upright or level bars, 1 to 4 pixels thick."""
+    mask = torch.zeros(size, size, dtype=torch.bool)
+    for _ in range(_integer(0, most + 1, generator)):
+        sides = [_integer(1, 5, generator), _integer(4, 25, generator)]
+        height, width = sides if _integer(0, 2, generator) else sides[::-1]
+        row, column = _integer(0, size, generator), _integer(0, size, generator)
+        mask[row : row + height, column : column + width] = True
+    return mask
+
+
+def _draw_color(generator: torch.Generator) -> torch.Tensor:
+    """Vivid, as markers are: one channel at 180 or more, one at 80 or less, ``[3, 1, 1]``."""
+    channels = _integer(180, 256, generator), _integer(0, 256, generator), _integer(0, 81, generator)
+    order = torch.randperm(3, generator=generator)
+    return torch.tensor(channels, dtype=torch.uint8)[order, None, None]
+
+
+def _integer(low: int, high: int, generator: torch.Generator) -> int:
+    return int(torch.randint(low, high, (), generator=generator))
 
 
 def _transform_pixels(pixels, mirror, shift, channels) -> torch.Tensor:

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
 from tensordict import TensorDict
 
 from dynmap_rl.envs import DynmapBatchedEnv, scene_seed
-from dynmap_rl.envs.world import EPISODE_STEPS
+from dynmap_rl.envs.tasks import get_task
+from dynmap_rl.envs.world import ACTION_LIMIT, EPISODE_STEPS
 from dynmap_rl.experts import list_checkpoints, load_expert
 
-PUSHES = 4  # in a disturbed demonstration
-PUSH_ACCELERATION = np.array([2.0, 2.0, 3.0])  # m/s^2, m/s^2, rad/s^2, the largest
 KEYS = [
     "pixels",
     "agent_pos",
@@ -33,8 +33,8 @@ class Plan:
         checkpoint: the expert's checkpoint.
         noise: standard deviation of the noise on the expert's acceleration, in units of its own exploration.
         detours: goals other than the scene's that the expert is sent to first.
-        pushes: spans ``(start, end)`` of steps in which not the expert acts but a random, constant acceleration,
-            so that the demonstration shows how to recover. Imitation leaves these steps out.
+        pushes: spans ``(start, end)`` of steps in which not the expert acts but a push towards a random velocity,
+            or to a stop, so that the demonstration shows how to recover. Imitation leaves these steps out.
     """
 
     scene_seed: int
@@ -44,28 +44,37 @@ class Plan:
     pushes: tuple[tuple[int, int], ...] = ()
 
 
-def plan_demonstrations(task: str, split: str, start: int, count: int) -> list[Plan]:
+def plan_demonstrations(
+    task: str, split: str, start: int, count: int, expert: str | Path | None = None
+) -> list[Plan]:
     """Candidates ``start .. start + count`` of a split: the checkpoints in turn, two of three episodes with pushes."""
-    checkpoints = list_checkpoints(task)
+    checkpoints = list_checkpoints(expert or task)
     plans = []
     for i in range(start, start + count):
         seed = scene_seed(split, i)
-        pushes = _draw_pushes(seed) if i % 3 else ()
+        pushes = _draw_pushes(seed, get_task(task).pushes) if i % 3 else ()
         plans.append(Plan(seed, checkpoints[i % len(checkpoints)], pushes=pushes))
     return plans
 
 
-def plan_exploration(task: str, split: str, start: int, count: int) -> list[Plan]:
+def plan_exploration(
+    task: str, split: str, start: int, count: int, expert: str | Path | None = None
+) -> list[Plan]:
     """Episodes that are no demonstrations: noisy experts that are sent to other places than the goal."""
-    checkpoints = list_checkpoints(task)
+    checkpoints = list_checkpoints(expert or task)
     return [
         Plan(scene_seed(split, i), checkpoints[i % len(checkpoints)], noise=(0.5, 1.0, 2.0)[i % 3], detours=3)
         for i in range(start, start + count)
     ]
 
 
-def roll_out(task: str, plans: list[Plan]) -> TensorDict:
+def roll_out(task: str, plans: list[Plan], expert: str | Path | None = None) -> TensorDict:
     """Run the plans as one batch.
+
+    Args:
+        task: name of the task.
+        plans: one an episode.
+        expert: whose checkpoints the plans name; by default the one that ships for the task.
 
     Returns:
         A TensorDict ``[E, 120]``: ``pixels``, ``agent_pos``, ``goal``, ``dynamics``, ``action`` as executed, and
@@ -74,7 +83,7 @@ def roll_out(task: str, plans: list[Plan]) -> TensorDict:
     n = len(plans)
     env = DynmapBatchedEnv(task, n, from_pixels=True)
     td = env.reset(TensorDict({"scene_seed": torch.tensor([p.scene_seed for p in plans])}, [n]))
-    networks = {name: load_expert(task, name) for name in sorted({p.checkpoint for p in plans})}
+    networks = {name: load_expert(expert or task, name) for name in sorted({p.checkpoint for p in plans})}
     rngs = [np.random.default_rng([p.scene_seed, 1]) for p in plans]
     detours = _detour_goals(plans, rngs)
     steps = []
@@ -83,8 +92,9 @@ def roll_out(task: str, plans: list[Plan]) -> TensorDict:
         goal = detours[:, t]  # [E, 2], NaN where the scene's own goal holds
         apart = 2 * (goal - td["dynamics", "position"][:, :2])
         state[:, :2] = torch.where(goal.isnan(), state[:, :2], apart)
-        acceleration = _expert_acceleration(t, state, plans, networks, rngs)
+        acceleration = _expert_acceleration(state, plans, networks, rngs)
         action = np.stack([w.action_for(a) for w, a in zip(env.worlds, acceleration, strict=True)])
+        _push(t, action, plans)
         td = env.step(td.set("action", torch.from_numpy(action.astype(np.float32))))
         executed = np.stack([w.action for w in env.worlds]).astype(np.float32)
         td["action"] = torch.from_numpy(executed)
@@ -93,24 +103,29 @@ def roll_out(task: str, plans: list[Plan]) -> TensorDict:
     return torch.stack(steps, 1)
 
 
-def _expert_acceleration(t, state, plans, networks, rngs) -> np.ndarray:
+def _expert_acceleration(state, plans, networks, rngs) -> np.ndarray:
     out = np.empty((len(plans), 3))
     for name, network in networks.items():
         rows = [i for i, p in enumerate(plans) if p.checkpoint == name]
         mean, std = network(state[rows])
         for row, m, s in zip(rows, mean.numpy(), std.numpy(), strict=True):
             out[row] = m + plans[row].noise * s * rngs[row].standard_normal(3)
+    return out
+
+
+def _push(t: int, action: np.ndarray, plans: list[Plan]) -> None:
+    """Put the pushes in the place of the actions; every other one brings the cart to a stop."""
     for row, plan in enumerate(plans):
         for number, (start, end) in enumerate(plan.pushes):
             if start <= t < end:
                 rng = np.random.default_rng([plan.scene_seed, 3, number])
-                out[row] = rng.uniform(-PUSH_ACCELERATION, PUSH_ACCELERATION)
-    return out
+                action[row] = rng.uniform(-ACTION_LIMIT, ACTION_LIMIT) * (number % 2)
 
 
-def _draw_pushes(scene_seed: int) -> tuple[tuple[int, int], ...]:
+def _draw_pushes(scene_seed: int, number: int) -> tuple[tuple[int, int], ...]:
+    """So many pushes, most of them early, while the cart is on its way."""
     rng = np.random.default_rng([scene_seed, 2])
-    starts = np.sort(rng.integers(2, EPISODE_STEPS - 25, PUSHES))
+    starts = np.sort(rng.exponential(30, number).astype(int).clip(0, EPISODE_STEPS - 25))
     return tuple((int(t), int(t + rng.integers(2, 7))) for t in starts)
 
 

@@ -20,9 +20,9 @@ import torch
 from tensordict import TensorDict
 from tqdm import tqdm
 
-from dynmap_rl.envs import SceneRanges
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.world import ACCELERATION_LIMIT, ACTION_LIMIT, EPISODE_STEPS, VELOCITY_LIMIT
+from dynmap_rl.experts import list_checkpoints
 from dynmap_rl.runs import read_json, start_worker, write_json
 
 from .demonstrations import Plan, plan_demonstrations, plan_exploration, roll_out
@@ -43,6 +43,7 @@ class Shard:
 
     folder: Path
     task: str
+    expert: str
     kind: str
     split: str
     number: int
@@ -56,6 +57,7 @@ def record_dataset(
     episodes: int = 300,
     eval_episodes: int = 50,
     workers: int = 2,
+    expert: str | Path | None = None,
 ) -> Path:
     """Record training and evaluation episodes, or go on with a recording that was interrupted.
 
@@ -64,6 +66,7 @@ def record_dataset(
         kind: ``demonstrations`` (successful episodes only) or ``exploration`` (noise and detours, all episodes).
         episodes, eval_episodes: the first are the split ``train``, the others ``eval``.
         workers: processes.
+        expert: folder of the expert's checkpoints; by default the one that ships for the task.
 
     Raises:
         ValueError: the folder holds something else, is being recorded to, or not enough episodes succeed.
@@ -73,6 +76,7 @@ def record_dataset(
 
     root = Path(root).expanduser()
     settings = {"task": task, "kind": kind, "episodes": episodes, "eval_episodes": eval_episodes}
+    settings["expert"] = str(expert or task)
     _check_settings(root, settings)
     parts = root.with_name(f"{root.name}.parts")
     if (root / META).exists() and not parts.exists():
@@ -124,6 +128,7 @@ def normalization_constants(episodes: TensorDict) -> dict[str, dict[str, list[fl
 
 def _check_settings(root: Path, settings: dict) -> None:
     get_task(settings["task"])
+    list_checkpoints(settings["expert"])
     if settings["kind"] not in KINDS:
         raise ValueError(f"unknown kind {settings['kind']!r}; choose from {KINDS}")
     if settings["episodes"] < 1 or settings["eval_episodes"] < 1:
@@ -132,12 +137,13 @@ def _check_settings(root: Path, settings: dict) -> None:
     if (root / META).exists():
         meta = load_meta(root)
         sizes = {name: end - first for name, (first, end) in meta["splits"].items()}
-        stored = {"task": meta["task"], "kind": meta["kind"]}
+        stored = {"task": meta["task"], "kind": meta["kind"], "expert": meta.get("expert", meta["task"])}
         stored |= {"episodes": sizes["train"], "eval_episodes": sizes["eval"]}
     elif root.exists() and (not root.is_dir() or any(root.iterdir())):
         raise ValueError(f"{root} exists and is no dataset of ours; choose another folder or delete it")
     elif (parts := root.with_name(f"{root.name}.parts") / "settings.json").exists():
         stored = read_json(parts)
+        stored.setdefault("expert", stored["task"])
     if stored not in (None, settings):
         changed = ", ".join(
             f"{k}: {stored[k]} there, {v} here" for k, v in settings.items() if stored[k] != v
@@ -165,6 +171,7 @@ def _plan_shards(parts: Path, settings: dict) -> list[Shard]:
         Shard(
             folder=parts / f"{split}_{number:04d}",
             task=settings["task"],
+            expert=settings["expert"],
             kind=settings["kind"],
             split=split,
             number=number,
@@ -220,7 +227,7 @@ def _roll_out_shard(shard: Shard) -> tuple[list[Plan], TensorDict]:
                 "recipes/expert.py"
             )
         candidates = _plan(shard, shard.number * CANDIDATES_PER_SHARD + start, size)
-        episodes = roll_out(shard.task, candidates)
+        episodes = roll_out(shard.task, candidates, shard.expert)
         good = episodes["next", "is_success"][:, -1, 0] | (shard.kind == "exploration")
         chosen = good.nonzero()[:missing, 0]
         plans += [candidates[i] for i in chosen.tolist()]
@@ -231,13 +238,13 @@ def _roll_out_shard(shard: Shard) -> tuple[list[Plan], TensorDict]:
 
 def _plan(shard: Shard, start: int, count: int) -> list[Plan]:
     if shard.kind == "demonstrations":
-        return plan_demonstrations(shard.task, shard.split, start, count)
+        return plan_demonstrations(shard.task, shard.split, start, count, shard.expert)
     offset = EXPLORATION_EVAL_START if shard.split == "eval" else 0
-    return plan_exploration(shard.task, "exploration", offset + start, count)
+    return plan_exploration(shard.task, "exploration", offset + start, count, shard.expert)
 
 
 def _describe(task: str, plan: Plan, episode: TensorDict) -> dict:
-    scene = get_task(task).sample_scene(np.random.default_rng(plan.scene_seed), SceneRanges())
+    scene = get_task(task).sample_scene(np.random.default_rng(plan.scene_seed))
     end = episode["next"][-1]
     return {
         **asdict(plan),
@@ -255,7 +262,8 @@ def _merge(shards: list[Shard], folder: Path, settings: dict) -> None:
     episodes = merge_datasets([s.folder for s in shards], folder, splits)
     if episodes.shape != (len(rows), EPISODE_STEPS):
         raise OSError(f"{folder} holds {tuple(episodes.shape)} episodes and steps after merging")
-    meta = {"format": FORMAT, "task": settings["task"], "kind": settings["kind"], "splits": splits}
+    known = {name: settings[name] for name in ("task", "expert", "kind")}
+    meta = {"format": FORMAT, **known, "splits": splits}
     meta["normalization"] = normalization_constants(episodes[:train])
     meta["episodes"] = [{"episode_index": i, **row} for i, row in enumerate(rows)]
     write_json(folder / META, meta)

@@ -11,7 +11,6 @@ from unittest import mock
 import numpy as np
 from tensordict import TensorDict
 
-from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.world import CONTROL_DT, EPISODE_STEPS
 
 from .loading import CAMERA, META, NEEDED, OPTIONAL, load_dataset, load_meta
@@ -119,11 +118,26 @@ def push_dataset(root: str | Path, repo_id: str) -> None:
         OSError: the hub refuses it or cannot be reached.
     """
     meta = load_meta(root)
+    with quiet():
+        from lerobot.datasets import LeRobotDataset
+
+        try:
+            dataset = LeRobotDataset(repo_id, root=root, video_backend="pyav")
+            description = _describe(meta, instruction=dataset.meta.tasks.index[0])
+            dataset.push_to_hub(tags=["dynamics"], license="mit", dataset_description=description)
+        except Exception as error:  # of the hub's client, or of the HTTP library below it
+            reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+            raise OSError(
+                f"cannot push {root} to {repo_id} ({reason}); check the name, the network, and `hf auth login`"
+            ) from error
+
+
+def _describe(meta: dict, instruction: str) -> str:
     exploring = meta["kind"] == "exploration"
-    description = DESCRIPTION.format(
+    return DESCRIPTION.format(
         kind=meta["kind"].capitalize(),
         task=meta["task"],
-        instruction=get_task(meta["task"]).description,
+        instruction=instruction,
         episodes=len(meta["episodes"]),
         steps=EPISODE_STEPS,
         fps=FPS,
@@ -132,17 +146,6 @@ def push_dataset(root: str | Path, repo_id: str) -> None:
         meta=META,
         splits=", ".join(f"{name} {first} to {end - 1}" for name, (first, end) in meta["splits"].items()),
     )
-    with quiet():
-        from lerobot.datasets import LeRobotDataset
-
-        try:
-            dataset = LeRobotDataset(repo_id, root=root, video_backend="pyav")
-            dataset.push_to_hub(tags=["dynamics"], license="mit", dataset_description=description)
-        except Exception as error:  # of the hub's client, or of the HTTP library below it
-            reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-            raise OSError(
-                f"cannot push {root} to {repo_id} ({reason}); check the name, the network, and `hf auth login`"
-            ) from error
 
 
 def _to_columns(episodes: TensorDict) -> dict[str, np.ndarray]:

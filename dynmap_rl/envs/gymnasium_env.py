@@ -10,7 +10,7 @@ from gymnasium import spaces
 
 from .renderer import Renderer
 from .scene import SceneRanges
-from .tasks import get_task
+from .tasks import choose_ranges, get_task
 from .world import ACCELERATION_LIMIT, CONTROL_DT, EPISODE_STEPS, VELOCITY_LIMIT
 
 ACTION_LIMITS = {"position": VELOCITY_LIMIT * CONTROL_DT, "acceleration": ACCELERATION_LIMIT}
@@ -32,31 +32,41 @@ class DynmapEnv(gym.Env):
         and room to brake before the edge of the workspace.
 
     Observation:
-        ``state``: float32 ``(16,)``, privileged, for experts (see ``BalanceReaching.state``).
+        ``state``: float32 ``(16,)`` or, in tasks 2 and 3, ``(20,)``, privileged, for experts (see ``state``
+        of each task in ``dynmap_rl.envs.tasks``).
         ``pixels``: uint8 ``(64, 64, 3)``.
         ``pixels_agent_pos``: a dict of ``pixels`` and ``agent_pos``, float32 ``(5,)``: commanded cart pose x, y,
         theta and goal x, y (m, m, rad, m, m).
 
-    Reward:
-        The task's, about 0 to 1 a step.
+    Goal:
+        Task 1, ``balance_reaching``, and task 2, ``balance_reaching_obstacle``: where the cart's centre shall be, a
+        green square. Task 3, ``bin_dropping``: the middle of the green bin's opening.
 
-    Success, drop, position error:
-        ``info`` holds ``is_success`` (set on the last step only), ``dropped`` and ``position_error`` (m, the mean
-        goal distance of the last 10 steps), as numpy scalars. Task 1: success if never dropped and the position
-        error at the end is under 50 mm. Dropped: the block leans over by more than 45 degrees relative to the cart,
-        its centre is below half its standing height, or it is beyond the cart's edge.
+    Reward:
+        About -1 to 1 a step (see ``reward`` of each task). Task 1: by the goal distance. Task 2: by the length of
+        the way around the obstacle, -1 for a drop or a touch. Task 3: 1 with the block in the bin, -1 once it
+        missed or the cart touched the bin, and up to 0.2 for a block that is near.
+
+    Success, drop, touch, position error:
+        ``info`` holds ``is_success``, ``dropped``, ``touched`` (cart or block touched obstacle or bin) and
+        ``position_error`` (m, the mean distance of cart and goal in the last 10 steps), as numpy scalars.
+        Dropped: the block leans over by more than 45 degrees relative to the cart, its centre is below half its
+        standing height, or it is beyond the cart's edge; a drop is never taken back. Success of task 1, on the last
+        step only: never dropped, and a position error under 50 mm. Of task 2: the obstacle is also untouched. Of
+        task 3, in every step of which it is true: the block rests in the bin, which the cart never touched.
 
     Starting state:
         Drawn from ``ranges`` by the seed; block upright and at rest on a level, resting cart.
 
     Termination, truncation:
-        Terminated when the block is dropped, truncated after 120 steps.
+        Terminated when the episode has failed for good (task 1: dropped; task 2: dropped or obstacle touched; task 3:
+        the block fell below the bin's floor beside it, or the cart touched the bin), truncated after 120 steps.
 
     Args:
-        task: name of the task.
+        task: name of the task, or ``"module:Class"`` of your own.
         obs_type: ``state``, ``pixels`` or ``pixels_agent_pos``.
         control: ``position`` or ``acceleration``.
-        ranges: what scenes are drawn from.
+        ranges: what scenes are drawn from; by default the task's own.
         render_mode: ``rgb_array`` or None.
         render_size: side of what ``render()`` returns, in pixels.
 
@@ -88,7 +98,7 @@ class DynmapEnv(gym.Env):
         self.task_description = self.task.description
         self.obs_type = obs_type
         self.control = control
-        self.ranges = ranges or SceneRanges()
+        self.ranges = choose_ranges(self.task, ranges)
         self.render_mode = render_mode
         self._render_size = render_size
         self._max_episode_steps = EPISODE_STEPS
@@ -118,7 +128,7 @@ class DynmapEnv(gym.Env):
             self.world.accelerate(action)
         world = self.world
         truncated = world.steps >= EPISODE_STEPS
-        return self._observe(), self.task.reward(world), world.dropped, truncated, self._info()
+        return self._observe(), self.task.reward(world), self.task.is_over(world), truncated, self._info()
 
     def render(self) -> np.ndarray | None:
         """uint8 ``[render_size, render_size, 3]``."""
@@ -139,6 +149,7 @@ class DynmapEnv(gym.Env):
         return {
             "is_success": np.bool_(self.task.is_success(self.world)),
             "dropped": np.bool_(self.world.dropped),
+            "touched": np.bool_(self.world.touched),
             "position_error": np.float32(self.world.position_error),
         }
 

@@ -13,7 +13,8 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # pygame imports the deprecated pkg_resources
     import pygame
 
-from .tasks import BalanceReaching, Polygon
+from .geometry import Polygon
+from .tasks import BalanceReaching
 from .world import World
 
 

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
+from typing import ClassVar
 
 import numpy as np
 
+Point = tuple[float, float]
 Range = tuple[float, float]
 Color = tuple[int, int, int]
 
 GOAL_COLOR: Color = (0, 200, 0)
+SIZES = ("_width", "_height", "_length", "_depth", "density")
 SPLITS = {"train": 0, "eval": 1, "validation": 2, "test": 3, "exploration": 4}
 SEEDS_PER_SPLIT = 100_000_000
 
@@ -38,9 +41,9 @@ class Scene:
     background_color: Color = (230, 230, 230)
 
     def __post_init__(self):
-        for size in ("cart_width", "cart_height", "block_width", "block_height", "density"):
-            if not getattr(self, size) > 0:
-                raise ValueError(f"scene: {size} must be positive, got {getattr(self, size)}")
+        for f in fields(self):
+            if f.name.endswith(SIZES) and not getattr(self, f.name) > 0:
+                raise ValueError(f"scene: {f.name} must be positive, got {getattr(self, f.name)}")
         if 2 * abs(self.block_shift) > self.cart_width:
             raise ValueError(f"scene: block_shift {self.block_shift} puts the block's centre beside the cart")
 
@@ -59,6 +62,24 @@ class Scene:
                 f"scene: unknown factor {sorted(unknown)}; known are {[f.name for f in fields(self)]}"
             )
         return replace(self, **{k: tuple(v) if k.endswith("color") else v for k, v in values.items()})
+
+
+@dataclass(frozen=True)
+class ObstacleScene(Scene):
+    """Task 2: a vertical obstacle, given by its middle and its length."""
+
+    obstacle_x: float = 0.5
+    obstacle_y: float = 0.5
+    obstacle_length: float = 0.2
+
+
+@dataclass(frozen=True)
+class BinScene(Scene):
+    """Task 3: a bin, whose opening has its middle at the goal, with its inner width and depth."""
+
+    goal_y: float = 0.2
+    bin_width: float = 0.28
+    bin_depth: float = 0.12
 
 
 @dataclass(frozen=True)
@@ -86,6 +107,32 @@ class SceneRanges:
     min_distance: float = 0.2
     min_contrast: float = 60.0
 
+    scene: ClassVar[type[Scene]] = Scene
+
+
+@dataclass(frozen=True)
+class ObstacleRanges(SceneRanges):
+    """Task 2: the obstacle stands in the centre of the picture."""
+
+    obstacle_x: Range = (0.5, 0.5)
+    obstacle_y: Range = (0.5, 0.5)
+    obstacle_length: Range = (0.2, 0.2)
+
+    scene: ClassVar[type[Scene]] = ObstacleScene
+
+
+@dataclass(frozen=True)
+class BinRanges(SceneRanges):
+    """Task 3: the cart starts above the bin's opening."""
+
+    cart_y: Range = (0.45, 0.68)
+    goal_x: Range = (0.2, 0.8)
+    goal_y: Range = (0.14, 0.26)
+    bin_width: Range = (0.24, 0.32)
+    bin_depth: Range = (0.10, 0.13)
+
+    scene: ClassVar[type[Scene]] = BinScene
+
 
 def sample_scene(rng: np.random.Generator, ranges: SceneRanges | None = None) -> Scene:
     """Draw a scene. The same generator state gives the same scene."""
@@ -93,7 +140,7 @@ def sample_scene(rng: np.random.Generator, ranges: SceneRanges | None = None) ->
     for _ in range(1000):
         factors = {
             f.name: float(rng.uniform(*getattr(r, f.name)))
-            for f in fields(Scene)
+            for f in fields(r.scene)
             if not f.name.endswith("color")
         }
         distance = np.hypot(factors["cart_x"] - factors["goal_x"], factors["cart_y"] - factors["goal_y"])
@@ -101,7 +148,7 @@ def sample_scene(rng: np.random.Generator, ranges: SceneRanges | None = None) ->
             break
     else:
         raise ValueError(f"scene: the ranges hold no start {r.min_distance} m from the goal; widen them")
-    return Scene(**factors, **_sample_colors(rng, r))
+    return r.scene(**factors, **_sample_colors(rng, r))
 
 
 def _sample_colors(rng: np.random.Generator, r: SceneRanges) -> dict[str, Color]:

@@ -1,22 +1,44 @@
-"""The tasks: what is drawn beside cart and block, what is rewarded, and what counts as success.
+"""The tasks: what is drawn beside cart and block, what is rewarded, and what counts as success (paper, Sec. IV-B).
 
-A task is any object with the attributes and methods of :class:`BalanceReaching`; to add one, write such a class
-and put it into :data:`TASKS`.
+A task is any object with the attributes and methods of :class:`BalanceReaching`. A task of your own needs no place
+in :data:`TASKS`: wherever a task is named, ``"your_module:YourTask"`` names the class.
 """
 
 from __future__ import annotations
 
+import importlib
 import math
 
 import numpy as np
 
-from .scene import GOAL_COLOR, Color, Scene, SceneRanges, sample_scene
-from .world import ACCELERATION_LIMIT, EPISODE_STEPS, VELOCITY_LIMIT, World
+from .geometry import (
+    Polygon,
+    bin_walls,
+    is_inside,
+    keep_out,
+    length,
+    segment,
+    square,
+    wall_polygon,
+    way_around,
+)
+from .scene import (
+    GOAL_COLOR,
+    BinRanges,
+    BinScene,
+    Color,
+    ObstacleRanges,
+    ObstacleScene,
+    Point,
+    Scene,
+    SceneRanges,
+    sample_scene,
+)
+from .world import ACCELERATION_LIMIT, CONTROL_DT, EPISODE_STEPS, VELOCITY_LIMIT, World
 
 SUCCESS_DISTANCE = 0.05  # m, about 3 pixels
 MARKER_SIZE = 0.04  # m
-
-Polygon = list[tuple[float, float]]
+REST_SPEED = 0.02  # m/s
 
 
 class BalanceReaching:
@@ -32,9 +54,11 @@ class BalanceReaching:
     name = "balance_reaching"
     description = "Carry the free-standing block to the green goal without dropping it."
     state_size = 16
+    ranges = SceneRanges()
+    pushes = 6  # in a disturbed demonstration, which shows how to recover from them
 
-    def sample_scene(self, rng: np.random.Generator, ranges: SceneRanges) -> Scene:
-        return sample_scene(rng, ranges)
+    def sample_scene(self, rng: np.random.Generator, ranges: SceneRanges | None = None) -> Scene:
+        return sample_scene(rng, ranges or self.ranges)
 
     def make_world(self, scene: Scene) -> World:
         return World(scene)
@@ -83,13 +107,16 @@ class BalanceReaching:
         if world.dropped:
             return 0.0
         d = world.goal_distance
-        effort = float(np.square(world.acceleration[:3] / ACCELERATION_LIMIT).sum())
-        return (
-            0.4 * math.exp(-4 * d)
-            + 0.6 * math.exp(-25 * d)
-            - 0.02 * effort
-            - 0.1 * min(abs(world.position[2]), 1.0)
-        )
+        return 0.4 * math.exp(-4 * d) + 0.6 * math.exp(-25 * d) - self.effort(world)
+
+    def effort(self, world: World) -> float:
+        """The penalty on acceleration and tilt of the cart."""
+        squared = float(np.square(world.acceleration[:3] / ACCELERATION_LIMIT).sum())
+        return 0.02 * squared + 0.1 * min(abs(world.position[2]), 1.0)
+
+    def is_over(self, world: World) -> bool:
+        """Whether the episode has failed for good, before its 120 steps have passed."""
+        return world.dropped
 
     def is_success(self, world: World) -> bool:
         return world.steps >= EPISODE_STEPS and not world.dropped and world.position_error < SUCCESS_DISTANCE
@@ -99,16 +126,153 @@ class BalanceReaching:
         return [(square(scene.goal_x, scene.goal_y, MARKER_SIZE), GOAL_COLOR)]
 
 
-def square(x: float, y: float, side: float) -> Polygon:
-    half = side / 2
-    return [(x - half, y - half), (x + half, y - half), (x + half, y + half), (x - half, y + half)]
+class BalanceReachingObstacle(BalanceReaching):
+    """Task 2: as task 1, around an obstacle in the centre, a vertical green segment that nothing may touch.
+
+    Start and goal are drawn so that the rectangle around the largest cart and block is 30 mm away from the obstacle.
+
+    Reward, in about [-1, 1] a step: task 1's, where the goal distance d (m) is the length of the shortest way around
+    the obstacle (``geometry.way_around``), and 5 for each metre by which a step shortened it; -1 once the block is
+    dropped or the obstacle touched.
+
+    Success: as in task 1, and neither cart nor block ever touched the obstacle.
+    """
+
+    name = "balance_reaching_obstacle"
+    description = "Carry the free-standing block around the obstacle to the green goal without dropping it."
+    state_size = 20
+    ranges = ObstacleRanges()
+
+    def sample_scene(self, rng: np.random.Generator, ranges: SceneRanges | None = None) -> Scene:
+        for _ in range(1000):
+            scene = super().sample_scene(rng, ranges)
+            ends = (scene.cart_x, scene.cart_y), (scene.goal_x, scene.goal_y)
+            if not any(is_inside(point, *keep_out(scene)) for point in ends):
+                return scene
+        raise ValueError("scene: the ranges hold no start and goal away from the obstacle; widen them")
+
+    def make_world(self, scene: ObstacleScene) -> World:
+        return World(scene, [segment(scene)])
+
+    def state(self, world: World) -> np.ndarray:
+        """As in task 1, with the next point of the shortest way around the obstacle in the place of the goal; then
+        the obstacle's middle relative to the cart (2), its length and the length of the way, ``[20]``."""
+        s, (x, y) = world.scene, world.position[:2].tolist()
+        way = self.way(world, (x, y))
+        # A cart within the margin first leaves it by a hair's breadth; what matters is where it goes then.
+        next_x, next_y = next((p for p in way if math.dist(p, (x, y)) > 0.02), way[-1])
+        state = super().state(world)
+        state[:2] = 2 * (next_x - x), 2 * (next_y - y)
+        obstacle = 2 * (s.obstacle_x - x), 2 * (s.obstacle_y - y), 5 * (s.obstacle_length - 0.2)
+        return np.concatenate([state, np.array([*obstacle, 2 * length(way)], dtype=np.float32)])
+
+    def way(self, world: World, start: Point) -> list[Point]:
+        return way_around(world.scene, start, tuple(world.goal.tolist()))
+
+    def reward(self, world: World) -> float:
+        if self.is_over(world):
+            return -1.0
+        before, now = (world.commanded - world.action)[:2].tolist(), world.commanded[:2].tolist()
+        d = length(self.way(world, tuple(now)))
+        progress = length(self.way(world, tuple(before))) - d
+        return 0.4 * math.exp(-4 * d) + 0.6 * math.exp(-25 * d) + 5 * progress - self.effort(world)
+
+    def is_over(self, world: World) -> bool:
+        return world.dropped or bool(world.touched)
+
+    def is_success(self, world: World) -> bool:
+        return super().is_success(world) and not world.touched
+
+    def markers(self, scene: ObstacleScene) -> list[tuple[Polygon, Color]]:
+        return [*super().markers(scene), (wall_polygon(*segment(scene)), GOAL_COLOR)]
 
 
-TASKS = {task.name: task for task in (BalanceReaching(),)}
+class BinDropping(BalanceReaching):
+    """Task 3: the block is tipped off the cart into a green bin.
+
+    The goal g is the middle of the bin's opening.
+
+    Reward: 1 in every step with the block in the bin, less small penalties on the cart's speed and tilt; -1 once it
+    missed or the cart touched the bin; before that ``0.2 exp(-4 d)`` for a distance d (m) of block and goal; always
+    less a small penalty on the cart's acceleration. It is shaped: the paper's has the 1 and the -1 alone.
+
+    Success: the block rests in the bin, its centre between the walls and below their top, slower than 20 mm/s
+    in this step and the one before, and the cart never touched the bin.
+    """
+
+    name = "bin_dropping"
+    description = "Tip the free-standing block into the green bin."
+    state_size = 20
+    ranges = BinRanges()
+    pushes = 3
+
+    def make_world(self, scene: BinScene) -> World:
+        return World(scene, bin_walls(scene))
+
+    def state(self, world: World) -> np.ndarray:
+        """As in task 1, then the goal relative to the block (2), the bin's width and its depth, ``[20]``."""
+        s = world.scene
+        x, y = (world.goal - world.position[3:5]).tolist()
+        values = np.array(
+            [2 * x, 2 * y, 20 * (s.bin_width - 0.28), 20 * (s.bin_depth - 0.12)], dtype=np.float32
+        )
+        return np.concatenate([super().state(world), values.clip(-10.0, 10.0)])
+
+    def reward(self, world: World) -> float:
+        if self.is_over(world):
+            return -1.0
+        effort = float(np.square(world.acceleration[:3] / ACCELERATION_LIMIT).sum())
+        if self.is_in_bin(world):
+            motion = float(np.square(world.velocity[:3] / VELOCITY_LIMIT).sum())
+            return 1.0 - 0.02 * effort - 0.1 * motion - 0.2 * min(abs(world.position[2]), 1.0)
+        return 0.2 * math.exp(-4 * math.dist(world.position[3:5], world.goal)) - 0.02 * effort
+
+    def is_in_bin(self, world: World) -> bool:
+        s, (x, y) = world.scene, world.position[3:5].tolist()
+        return abs(x - s.goal_x) < s.bin_width / 2 and s.goal_y - s.bin_depth < y < s.goal_y
+
+    def is_over(self, world: World) -> bool:
+        missed = world.position[4] < world.scene.goal_y - world.scene.bin_depth
+        return bool(missed) or "cart" in world.touched
+
+    def is_success(self, world: World) -> bool:
+        now = world.velocity[3:5]
+        before = now - world.acceleration[3:5] * CONTROL_DT
+        rests = max(np.linalg.norm(now), np.linalg.norm(before)) < REST_SPEED
+        return bool(rests) and self.is_in_bin(world) and "cart" not in world.touched
+
+    def markers(self, scene: BinScene) -> list[tuple[Polygon, Color]]:
+        return [(wall_polygon(*wall), GOAL_COLOR) for wall in bin_walls(scene)]
+
+
+TASKS = {task.name: task for task in (BalanceReaching(), BalanceReachingObstacle(), BinDropping())}
+
+
+def choose_ranges(task: BalanceReaching, ranges: SceneRanges | None) -> SceneRanges:
+    """The ranges themselves, or the task's own for None; ``ValueError`` for those of another task's scenes."""
+    if ranges is None:
+        return task.ranges
+    if not issubclass(ranges.scene, task.ranges.scene):
+        raise ValueError(f"{task.name} needs {type(task.ranges).__name__}, not {type(ranges).__name__}")
+    return ranges
 
 
 def get_task(name: str) -> BalanceReaching:
-    """The task of a name; ``ValueError`` lists the known ones."""
+    """The task of a name, or of a class that is named as ``"module:Class"``.
+
+    Raises:
+        ValueError: there is no such task; the message lists the known ones.
+    """
+    if ":" in name:
+        module, attribute = name.split(":", 1)
+        if not module or module.startswith("."):
+            raise ValueError(f"there is no task {name!r}; name a class as module:Class")
+        try:
+            return getattr(importlib.import_module(module), attribute)()
+        except (ImportError, AttributeError) as error:
+            raise ValueError(f"there is no task {name!r} ({error})") from error
     if name not in TASKS:
-        raise ValueError(f"unknown task {name!r}; choose from {sorted(TASKS)}")
+        raise ValueError(
+            f"unknown task {name!r}; choose from {sorted(TASKS)}, or name a class as module:Class"
+        )
     return TASKS[name]

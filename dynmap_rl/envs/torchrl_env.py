@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -11,8 +13,10 @@ from torchrl.envs import EnvBase
 from .gymnasium_env import ACTION_LIMITS, agent_pos
 from .renderer import Renderer
 from .scene import SceneRanges
-from .tasks import get_task
+from .tasks import choose_ranges, get_task
 from .world import EPISODE_STEPS, World
+
+EVENTS = ("dropped", "touched", "is_success")
 
 
 class DynmapBatchedEnv(EnvBase):
@@ -21,18 +25,18 @@ class DynmapBatchedEnv(EnvBase):
     The same seeds and actions give the same trajectories as the Gymnasium ids, with any ``num_envs``.
 
     Observation keys: ``state`` ``[N, S]`` (privileged), ``agent_pos`` ``[N, 5]``, ``goal`` ``[N, 2]``,
-    ``("dynamics", "position" | "velocity" | "acceleration")`` ``[N, 6]`` (SI units), ``dropped``, ``is_success``
-    ``[N, 1]``, ``position_error`` ``[N, 1]`` (m), and ``pixels`` uint8 ``[N, 3, 64, 64]`` with ``from_pixels``.
+    ``("dynamics", "position" | "velocity" | "acceleration")`` ``[N, 6]`` (SI units), ``dropped``, ``touched``,
+    ``is_success`` ``[N, 1]``, ``position_error`` ``[N, 1]`` (m), and ``pixels`` uint8 ``[N, 3, 64, 64]`` with ``from_pixels``.
 
     A reset draws each world's scene from the environment's seed, or, where the reset TensorDict has an entry
     ``scene_seed`` ``[N]`` (int64), from that: ``env.reset(TensorDict(scene_seed=torch.arange(n), batch_size=[n]))``.
 
     Args:
-        task: name of the task.
+        task: name of the task, or ``"module:Class"`` of your own.
         num_envs: number of worlds N.
         from_pixels: draw a frame a step.
         control: ``position`` or ``acceleration`` (see ``DynmapEnv``).
-        ranges: what scenes are drawn from.
+        ranges: what scenes are drawn from; by default the task's own.
         seed: of the scenes.
     """
 
@@ -55,7 +59,7 @@ class DynmapBatchedEnv(EnvBase):
         super().__init__(device=device, batch_size=[num_envs])
         self.task = get_task(task)
         self.control = control
-        self.ranges = ranges or SceneRanges()
+        self.ranges = choose_ranges(self.task, ranges)
         self.renderer = Renderer() if from_pixels else None
         self.worlds: list[World | None] = [None] * num_envs
         self._make_specs()
@@ -74,8 +78,7 @@ class DynmapBatchedEnv(EnvBase):
             "goal": unbounded(len(self.task.goal(self.task.make_world(_any_scene(self))))),
             "dynamics": Composite(dynamics, shape=(n,), device=device),
             "position_error": unbounded(1),
-            "dropped": Binary(1, (n, 1), dtype=torch.bool, device=device),
-            "is_success": Binary(1, (n, 1), dtype=torch.bool, device=device),
+            **{name: Binary(1, (n, 1), dtype=torch.bool, device=device) for name in EVENTS},
         }
         if self.renderer:
             observation["pixels"] = Bounded(0, 255, (n, 3, 64, 64), dtype=torch.uint8, device=device)
@@ -103,7 +106,7 @@ class DynmapBatchedEnv(EnvBase):
             seed = int(seeds[i]) if seeds is not None else int(self.rng.integers(2**63))
             scene = self.task.sample_scene(np.random.default_rng(seed), self.ranges)
             self.worlds[i] = self.task.make_world(scene)
-        return self._observe().update(self._flags())
+        return self._observe().update(self._done())
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         actions = tensordict["action"].detach().cpu().numpy()
@@ -113,7 +116,7 @@ class DynmapBatchedEnv(EnvBase):
             else:
                 world.accelerate(action)
         reward = np.array([self.task.reward(world) for world in self.worlds], dtype=np.float32)
-        return self._observe().update(self._flags()).set("reward", self._tensor(reward[:, None]))
+        return self._observe().update(self._done()).set("reward", self._tensor(reward[:, None]))
 
     def _observe(self) -> TensorDict:
         worlds, task = self.worlds, self.task
@@ -124,22 +127,22 @@ class DynmapBatchedEnv(EnvBase):
             "goal": self._tensor(np.stack([task.goal(w) for w in worlds])),
             "dynamics": {k: self._tensor(np.stack([getattr(w, k) for w in worlds])) for k in names},
             "position_error": self._tensor(np.array([[w.position_error] for w in worlds])),
-            "is_success": torch.tensor([[task.is_success(w)] for w in worlds], device=self.device),
+            "dropped": self._flag(w.dropped for w in worlds),
+            "touched": self._flag(bool(w.touched) for w in worlds),
+            "is_success": self._flag(task.is_success(w) for w in worlds),
         }
         if self.renderer:
             frames = np.stack([self.renderer.draw(w, task) for w in worlds])
             data["pixels"] = torch.from_numpy(frames).permute(0, 3, 1, 2).to(self.device)
         return TensorDict(data, batch_size=self.batch_size, device=self.device)
 
-    def _flags(self) -> dict[str, torch.Tensor]:
-        dropped = torch.tensor([[w.dropped] for w in self.worlds], device=self.device)
-        truncated = torch.tensor([[w.steps >= EPISODE_STEPS] for w in self.worlds], device=self.device)
-        return {
-            "dropped": dropped,
-            "terminated": dropped.clone(),
-            "truncated": truncated,
-            "done": dropped | truncated,
-        }
+    def _done(self) -> dict[str, torch.Tensor]:
+        terminated = self._flag(self.task.is_over(w) for w in self.worlds)
+        truncated = self._flag(w.steps >= EPISODE_STEPS for w in self.worlds)
+        return {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
+
+    def _flag(self, values: Iterable[bool]) -> torch.Tensor:
+        return torch.tensor([[value] for value in values], device=self.device)
 
     def _tensor(self, array: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(array.astype(np.float32, copy=False)).to(self.device)

@@ -6,11 +6,12 @@ Plain Python and PyMunk. SI units: m, s, rad, kg. Gravity points along -y.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pymunk
 
-from .scene import Scene
+from .scene import Point, Scene
 
 GRAVITY = 9.81  # m/s^2
 CONTROL_DT = 0.05  # s, 20 Hz
@@ -27,10 +28,21 @@ ACTION_LIMIT = VELOCITY_LIMIT * CONTROL_DT  # the largest change of the commande
 
 GROUND = -0.25  # m, where a dropped block comes to lie, below the picture
 DROP_TILT = math.pi / 4  # rad, relative to the cart
+WALL_RADIUS = 0.01  # m, half the thickness of a wall
+
+Wall = tuple[Point, Point]  # the ends of its middle line, m
+CART, BLOCK, WALL = 1, 2, 3  # PyMunk collision types
 
 
 class World:
-    """Cart and block of one scene.
+    """Cart and block of one scene, and walls that do not move.
+
+    The block collides with walls; the cart, which follows its command whatever comes, goes through them. Both are
+    noticed.
+
+    Args:
+        scene: sizes and start.
+        walls: the ends of each, 20 mm thick and rounded.
 
     Arrays hold cart x, y, theta, block x, y, theta, in this order, ``[6]`` float64:
 
@@ -44,10 +56,11 @@ class World:
         dropped: the block is, or once was, no longer carried: it leaned over by more than 45 degrees relative
             to the cart, its centre sank below half its standing height over the cart's top, or it moved beyond
             the cart's edge.
+        touched: which of ``"cart"`` and ``"block"`` touches, or once touched, a wall.
         errors: distance of cart and goal after every control step, the start first (m).
     """
 
-    def __init__(self, scene: Scene):
+    def __init__(self, scene: Scene, walls: Sequence[Wall] = ()):
         self.scene = scene
         self.goal = np.array([scene.goal_x, scene.goal_y])
         self.space = pymunk.Space()
@@ -56,6 +69,7 @@ class World:
         self._add_ground()
         self._add_cart(scene)
         self._add_block(scene)
+        self._add_walls(walls)
         self.commanded = np.array([scene.cart_x, scene.cart_y, 0.0])
         self.action = np.zeros(3)
         self.position = self._read_position()
@@ -77,6 +91,7 @@ class World:
         self.cart.position = (s.cart_x, s.cart_y)
         shape = pymunk.Poly.create_box(self.cart, (s.cart_width, s.cart_height))
         shape.friction = 1.0  # Chipmunk multiplies the two frictions
+        shape.collision_type = CART
         self.space.add(self.cart, shape)
 
     def _add_block(self, s: Scene) -> None:
@@ -86,7 +101,21 @@ class World:
         self.block.position = (s.cart_x + s.block_shift, s.cart_y + (s.cart_height + s.block_height) / 2)
         shape = pymunk.Poly.create_box(self.block, size)
         shape.friction = s.friction
+        shape.collision_type = BLOCK
         self.space.add(self.block, shape)
+
+    def _add_walls(self, walls: Sequence[Wall]) -> None:
+        self.touched: set[str] = set()
+        if not walls:
+            return
+        for start, end in walls:
+            shape = pymunk.Segment(self.space.static_body, start, end, WALL_RADIUS)
+            shape.friction = 1.0
+            shape.collision_type = WALL
+            self.space.add(shape)
+        touched = self.touched
+        self.space.on_collision(CART, WALL, begin=lambda *_: touched.add("cart"))
+        self.space.on_collision(BLOCK, WALL, begin=lambda *_: touched.add("block"))
 
     def step(self, action: np.ndarray) -> None:
         """One control step of 50 ms with the position-update action ``(dX, dY, dTheta)`` (m, m, rad).

@@ -1,15 +1,16 @@
 """Closed-loop rollouts, DR / PE / SR, statistics and figures."""
 
-from .paper import TABLE_1, parse_supervision, row_name
+from .paper import TABLES, paper_numbers, parse_supervision, row_name
 from .report import SHARED_STARTS, evaluate, print_row, write_report
 from .rollout import episode_rows, roll_out, scene_seeds
 from .statistics import success_gap, summarize, summarize_seeds, wilson
 
 __all__ = [
     "SHARED_STARTS",
-    "TABLE_1",
+    "TABLES",
     "episode_rows",
     "evaluate",
+    "paper_numbers",
     "parse_supervision",
     "print_row",
     "roll_out",

@@ -72,6 +72,36 @@ def plot_dynamics(world_model: WorldModel, episode: TensorDictBase, path: Path) 
     _save(figure, path)
 
 
+def plot_distributions(dynamics: dict[str, TensorDictBase], path: Path) -> dict[str, dict[str, list[float]]]:
+    """Histograms of the angles and angular velocities of cart and block, the tasks side by side.
+
+    Args:
+        dynamics: task name to ``position`` and ``velocity`` ``[E, T, 6]``.
+        path: of the picture.
+
+    Returns:
+        For each task and each histogram the 0.1, 50 and 99.9 % quantiles of the magnitude (rad, rad/s).
+    """
+    panels = {
+        f"{body} {name}": (quantity, index, unit)
+        for name, quantity, unit in (("angle", "position", "rad"), ("angular velocity", "velocity", "rad/s"))
+        for body, index in (("cart", 2), ("block", 5))
+    }
+    figure, axes = plt.subplots(len(dynamics), len(panels), figsize=(12, 2 * len(dynamics)), squeeze=False)
+    ranges: dict[str, dict[str, list[float]]] = {task: {} for task in dynamics}
+    for column, (title, (quantity, index, unit)) in enumerate(panels.items()):
+        values = {task: d[quantity][..., index].flatten().double().numpy() for task, d in dynamics.items()}
+        limit = max(np.abs(v).max() for v in values.values())
+        for row, (task, value) in enumerate(values.items()):
+            axis = axes[row, column]
+            axis.hist(value, bins=np.linspace(-limit, limit, 81), log=True, color="tab:green")
+            axis.set_title(f"{task}: {title} [{unit}]", fontsize=7)
+            axis.tick_params(labelsize=6)
+            ranges[task][title] = np.quantile(np.abs(value), (0.001, 0.5, 0.999)).round(4).tolist()
+    _save(figure, path)
+    return ranges
+
+
 def save_gif(episodes: TensorDictBase, path: Path, columns: int = 4, scale: int = 3) -> None:
     """Frames ``pixels`` ``[E, T, 3, 64, 64]`` of E episodes as one animation in real time."""
     frames = episodes["pixels"].permute(1, 0, 3, 4, 2).numpy()  # (T, E, 64, 64, 3)

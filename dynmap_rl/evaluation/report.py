@@ -13,10 +13,11 @@ from dynmap_rl.envs import scene_seed
 from dynmap_rl.modules import Actor, WorldModel, load_policy
 from dynmap_rl.runs import read_json, write_json
 
-from .paper import TABLE_1, row_name
+from .paper import METRICS, paper_numbers, row_name
 from .rollout import episode_rows, roll_out, scene_seeds
 from .statistics import summarize, summarize_seeds
 
+UNITS = {"DR": "%", "PE": "mm", "SR": "%"}
 SHARED_STARTS = 1000  # the paper's protocol uses the scenes after these
 
 
@@ -44,7 +45,14 @@ def evaluate(
 
 
 def write_report(
-    folder: Path, settings, dataset, world_model, episodes: TensorDictBase, seeds, frozen
+    folder: Path,
+    settings,
+    dataset,
+    world_model,
+    episodes: TensorDictBase,
+    seeds,
+    frozen,
+    source: dict | None = None,
 ) -> dict:
     """Collect the seeds' results into ``eval.json`` and draw the figures.
 
@@ -55,6 +63,7 @@ def write_report(
         world_model: the frozen one; ``frozen`` is its fingerprint.
         episodes: held-out demonstrations ``[E, T]``, for the figures.
         seeds: of the policies.
+        source: where the world model is from, with its ``task`` and ``training``; by default this very run.
     """
     from .figures import plot_dynamics, plot_reconstruction, save_gif
 
@@ -68,6 +77,7 @@ def write_report(
         "policy": settings.policy,
         "task": settings.task,
         "trained_on": {"dataset": str(dataset), "kind": meta["kind"], "episodes": meta["splits"]["train"][1]},
+        "world_model": source or {"task": settings.task, "training": "decoupled"},
         "seeds": list(seeds),
         "world_model_sha256": frozen,
         "paper_protocol": summarize_seeds([_rows(r["paper"]["rows"]) for r in results]),
@@ -95,45 +105,49 @@ def read_rows(path: Path) -> list[list[dict]]:
 
 def print_row(result: dict) -> None:
     """The table row, beside the paper's."""
-    ours, test = result["paper_protocol"], result["test_protocol"]
+    ours, test, paper = result["paper_protocol"], result["test_protocol"], paper_numbers(result)
     low, high = test["SR_interval"]
-    print(
-        f"\n{result['row']}, {result['policy']} policy, {result['task']}: drop rate, position error, success rate"
-    )
-    print("  paper's protocol  " + _cells(ours["DR"], ours["PE"], ours["SR"]))
-    paper = TABLE_1.get(result["policy"], {}).get(result["row"])
-    if paper and result["task"] == "balance_reaching":
-        print("  paper             " + _cells(*paper))
-    print(
-        f"  {test['episodes']} episodes     DR {test['DR']:.1f} %   PE {test['PE']:.1f} mm   "
-        f"SR {test['SR']:.1f} % [{low:.1f}, {high:.1f}]"
-    )
+    print(f"\n{_label(result)}, {result['policy']} policy, {result['task']}")
+    print("  paper's protocol  " + _cells({name: ours[name] for name in _metrics(result)}))
+    if paper:
+        print("  paper             " + _cells(paper))
+    values = "   ".join(f"{name} {test[name]:.1f} {UNITS[name]}" for name in _metrics(result))
+    print(f"  {test['episodes']} episodes     {values} [{low:.1f}, {high:.1f}]")
 
 
 def markdown_row(result: dict) -> str:
     """The row of the README's table: the paper's numbers, ours by its protocol, ours on the shared start states."""
-    ours, test = result["paper_protocol"], result["test_protocol"]
+    ours, test, paper = result["paper_protocol"], result["test_protocol"], paper_numbers(result)
     low, high = test["SR_interval"]
+    metrics = _metrics(result)
     cells = [
-        f"{result['row']}, {result['policy']}",
-        _short(*TABLE_1[result["policy"]][result["row"]]),
-        _short(ours["DR"], ours["PE"], ours["SR"]),
-        f"{test['DR']:.1f}",
-        f"{test['PE']:.1f}",
+        f"{_label(result)}, {result['policy']}",
+        _short(paper) if paper else "-",
+        _short({name: ours[name] for name in metrics}),
+        *(f"{test[name]:.1f}" for name in metrics if name != "SR"),
         f"**{test['SR']:.1f}** [{low:.1f}, {high:.1f}]",
     ]
     return f"| {' | '.join(cells)} |"
 
 
-def _short(drop, error, success) -> str:
-    return f"{success[0]:.0f} ({success[1]:.1f}); {drop[0]:.0f}, {error[0]:.0f}"
+def _label(result: dict) -> str:
+    """The row's name, with the world model's task where it is another."""
+    source = result.get("world_model", result)["task"]
+    return result["row"] if source == result["task"] else f"{result['row']} of {source}"
 
 
-def _cells(drop, error, success) -> str:
-    return (
-        f"DR {drop[0]:.0f} ({drop[1]:.1f}) %   PE {error[0]:.0f} ({error[1]:.1f}) mm   "
-        f"SR {success[0]:.0f} ({success[1]:.1f}) %"
-    )
+def _metrics(result: dict) -> tuple[str, ...]:
+    return METRICS.get(result["task"], tuple(UNITS))
+
+
+def _short(numbers: dict) -> str:
+    mean, std = numbers["SR"]
+    others = ", ".join(f"{numbers[name][0]:.0f}" for name in numbers if name != "SR")
+    return f"{mean:.0f} ({std:.1f})" + (f"; {others}" if others else "")
+
+
+def _cells(numbers: dict) -> str:
+    return "   ".join(f"{name} {mean:.0f} ({std:.1f}) {UNITS[name]}" for name, (mean, std) in numbers.items())
 
 
 def _columns(rows: list[dict]) -> dict[str, list]:

@@ -23,14 +23,19 @@ def roll_out(actor: Actor, task: str, seeds: list[int], keep_pixels: bool = Fals
 
     Returns:
         A TensorDict ``[E, 120]`` with the environment's entries at t (``dynamics``, ``action``, ``goal``, ...;
-        ``pixels`` only where kept) and ``("next", "position_error" | "dropped" | "is_success")``; with a world model
+        ``pixels`` only where kept) and ``("next", "position_error" | "dropped" | "touched" | "is_success")``; with a world model
         that decodes dynamics, also ``("predicted_dynamics", quantity)`` at t, its one-step prediction along
         these rollouts (zeros at t = 0).
     """
     actor = actor.eval()
     env = DynmapBatchedEnv(task, len(seeds), from_pixels=True)
     td = env.reset(TensorDict({"scene_seed": torch.tensor(seeds)}, [len(seeds)]))
-    keys = ["action", "goal", "dynamics", *(("next", k) for k in ("position_error", "dropped", "is_success"))]
+    keys = [
+        "action",
+        "goal",
+        "dynamics",
+        *(("next", k) for k in ("position_error", "dropped", "touched", "is_success")),
+    ]
     keys += ["pixels"] if keep_pixels else []
     steps = []
     predicted = {q: torch.zeros(len(seeds), 6) for q in actor.world_model.supervision}
@@ -46,7 +51,7 @@ def roll_out(actor: Actor, task: str, seeds: list[int], keep_pixels: bool = Fals
 
 
 def episode_rows(episodes: TensorDict, seeds: list[int]) -> list[dict]:
-    """One JSON-ready row an episode: scene seed, dropped, position error (m), success, and, where the world model
+    """One JSON-ready row an episode: scene seed, dropped, touched a wall, position error (m), success, and, where the world model
     decodes positions, the mean distance between predicted and true cart position (m), in all steps and in those
     more than 0.1 m away from the goal."""
     last = episodes["next"][:, -1]
@@ -54,6 +59,7 @@ def episode_rows(episodes: TensorDict, seeds: list[int]) -> list[dict]:
         {
             "scene_seed": seed,
             "dropped": bool(last["dropped"][i]),
+            "touched": bool(last["touched"][i]),
             "position_error": round(last["position_error"][i].item(), 5),
             "success": bool(last["is_success"][i]),
         }

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import torch
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor
 
+from dynmap_rl.envs.tasks import BalanceReaching
+from dynmap_rl.envs.world import EPISODE_STEPS, World
 from dynmap_rl.runs import load_weights, read_json
 
 CHECKPOINTS = Path(__file__).parent / "checkpoints"
@@ -45,21 +49,59 @@ def make_actor(network: ExpertNetwork) -> ProbabilisticActor:
     )
 
 
-def list_checkpoints(task: str) -> list[str]:
-    """The names of a task's shipped checkpoints, earliest first; ``ValueError`` where there is none."""
-    names = sorted(path.stem for path in (CHECKPOINTS / task).glob("*.safetensors"))
+@torch.no_grad()
+def roll_out(
+    network: ExpertNetwork,
+    task: BalanceReaching,
+    scene_seeds: Sequence[int],
+    states: BalanceReaching | None = None,
+) -> list[World]:
+    """Run the mean action on one scene a seed for 120 steps; the worlds are as they are at the end.
+
+    Args:
+        states: the task whose ``state`` the expert was trained on, where it is not ``task``.
+    """
+    worlds = [task.make_world(task.sample_scene(np.random.default_rng(seed))) for seed in scene_seeds]
+    for _ in range(EPISODE_STEPS):
+        state = np.stack([(states or task).state(world) for world in worlds])
+        mean, _ = network(torch.from_numpy(state))
+        for world, acceleration in zip(worlds, mean.numpy(), strict=True):
+            world.accelerate(acceleration)
+    return worlds
+
+
+def list_checkpoints(expert: str | Path) -> list[str]:
+    """The names of an expert's checkpoints, earliest first.
+
+    Args:
+        expert: the name of a task whose expert ships with the package, or the ``checkpoint`` folder of a run of
+            ``recipes/expert.py``.
+
+    Raises:
+        ValueError: there is none.
+    """
+    names = sorted(path.stem for path in find_expert(expert).glob("*.safetensors"))
     if not names:
-        raise ValueError(f"no expert is shipped for task {task!r}; train one with recipes/expert.py")
+        raise ValueError(
+            f"no expert at {expert}; train one with recipes/expert.py and name its checkpoint folder"
+        )
     return names
 
 
-def load_expert(task: str, checkpoint: str | None = None) -> ExpertNetwork:
-    """A shipped expert, the last checkpoint unless one is named. Its facts are in the JSON file beside it."""
-    known = list_checkpoints(task)
+def load_expert(expert: str | Path, checkpoint: str | None = None) -> ExpertNetwork:
+    """An expert (see :func:`list_checkpoints`), the last checkpoint unless one is named. Its facts are in the JSON
+    file beside it."""
+    known = list_checkpoints(expert)
     checkpoint = checkpoint or known[-1]
     if checkpoint not in known:
-        raise ValueError(f"no checkpoint {checkpoint!r} for task {task!r}; choose from {known}")
-    facts = read_json(CHECKPOINTS / task / f"{checkpoint}.json")
+        raise ValueError(f"no checkpoint {checkpoint!r} of the expert {expert}; choose from {known}")
+    folder = find_expert(expert)
+    facts = read_json(folder / f"{checkpoint}.json")
     network = ExpertNetwork(facts["state_size"], tuple(facts["acceleration_limit"]), facts["hidden"])
-    load_weights(CHECKPOINTS / task / f"{checkpoint}.safetensors", network)
+    load_weights(folder / f"{checkpoint}.safetensors", network)
     return network.eval().requires_grad_(False)
+
+
+def find_expert(expert: str | Path) -> Path:
+    shipped = CHECKPOINTS / expert
+    return shipped if shipped.is_dir() else Path(expert)

@@ -12,7 +12,8 @@ from .layers import down, same
 class Encoder(nn.Module):
     """A plain CNN: uint8 or float frames ``[..., 3, 64, 64]`` in 0..255 to a latent ``[..., Z]``.
 
-    Strided convolutions down to 8 x 8. With ``keypoints`` a spatial softmax reads the
+    Strided convolutions down to 8 x 8. The frame's mean colour, which their norms take away, reaches the latent
+    through a linear map of its own. With ``keypoints`` a spatial softmax reads the
     expected position of every channel of the 8 x 8 and 16 x 16 maps (Levine et al. 2016) and stands beside the
     flattened map, so that the position of an object reaches the latent to a fraction of a pixel.
 
@@ -36,6 +37,7 @@ class Encoder(nn.Module):
             self.squeeze = nn.Conv2d(c3, 8, 1)
             features = 8 * 64 + 2 * 2 * 32
         self.project = nn.Linear(features, latent_size)
+        self.color = nn.Linear(3, latent_size, bias=False)
 
     def forward(self, pixels: torch.Tensor) -> torch.Tensor:
         if pixels.shape[-3:] != (3, 64, 64):
@@ -47,6 +49,7 @@ class Encoder(nn.Module):
 
     def _encode(self, x: torch.Tensor) -> torch.Tensor:
         x = x.contiguous(memory_format=torch.channels_last).to(self.project.weight.dtype) / 255 - 0.5
+        color = x.mean((2, 3))
         x = self.stem(x)  # (N, C, 16, 16)
         y = self.top(x)  # (N, C, 8, 8)
         if self.keypoints:
@@ -54,7 +57,7 @@ class Encoder(nn.Module):
             features = torch.cat([self.squeeze(y).flatten(1), *points], -1)
         else:
             features = y.flatten(1)
-        return self.project(features)  # (N, Z)
+        return self.project(features) + 5 * self.color(color)  # (N, Z)
 
 
 class SpatialSoftmax(nn.Module):

@@ -1,6 +1,7 @@
-"""What is recorded is what happened, however the recording was interrupted."""
+"""Recordings: what is kept, what is known of it, and how an interrupted one goes on."""
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,79 +17,23 @@ from tensordict import TensorDict
 
 from dynmap_rl.data import load_dataset, load_meta, normalization_constants, record_dataset
 from dynmap_rl.data import recording as module
-from dynmap_rl.data.demonstrations import Plan, roll_out
 from dynmap_rl.data.writing import FEATURES
-from dynmap_rl.envs import Scene, World, sample_scene
-from dynmap_rl.envs.world import CONTROL_DT, VELOCITY_LIMIT
+from dynmap_rl.envs import sample_scene
+from dynmap_rl.envs.world import VELOCITY_LIMIT
+from dynmap_rl.experts import list_checkpoints
 from dynmap_rl.runs import write_json
 
 DYNAMICS = ("position", "velocity", "acceleration")
-
-
-def plan_of(row: dict) -> Plan:
-    pushes = tuple(tuple(span) for span in row["pushes"])
-    return Plan(row["scene_seed"], row["checkpoint"], row["noise"], row["detours"], pushes)
 
 
 def files(root) -> dict[str, bytes]:
     return {str(p.relative_to(root)): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
 
 
-def test_round_trip_is_exact(recording):
-    episodes, rows = load_dataset(recording), load_meta(recording)["episodes"]
-    assert episodes.shape == (6, 120)
-    for shard in (slice(0, 2), slice(2, 4), slice(4, 6)):
-        truth = roll_out("balance_reaching", [plan_of(row) for row in rows[shard]])
-        for key in ("pixels", "agent_pos", "goal", "action", *(("dynamics", k) for k in DYNAMICS)):
-            assert episodes[shard][key].dtype == truth[key].dtype
-            assert torch.equal(episodes[shard][key], truth[key]), key
-        for ours, theirs in (("reward", "reward"), ("done", "done"), ("success", "is_success")):
-            assert torch.equal(episodes[shard]["next", ours], truth["next", theirs])
-
-
-def test_replay_of_the_stored_actions_from_the_stored_scene(recording):
-    episodes, meta = load_dataset(recording), load_meta(recording)
-    for episode, row in zip(episodes, meta["episodes"], strict=True):
-        world = World(Scene.from_dict(row["scene"]))
-        for step in episode:
-            for name in DYNAMICS:
-                np.testing.assert_array_equal(
-                    step["dynamics", name].numpy(), getattr(world, name).astype(np.float32)
-                )
-            world.step(step["action"].numpy())
-        assert row["position_error"] == pytest.approx(world.position_error, abs=1e-6)
-
-
-def test_a_row_is_what_was_seen_before_its_action(recording):
-    episodes = load_dataset(recording).double()
-    position, velocity, acceleration = (episodes["dynamics", name] for name in DYNAMICS)
-    change = (velocity[:, 1:] - velocity[:, :-1]) / CONTROL_DT
-    torch.testing.assert_close(acceleration[:, 1:], change, atol=1e-4, rtol=0)
-    assert not acceleration[:, 0].any()
-    assert not velocity[:, 0].any()
-    moved = position[:, 1:, :3] - position[:, :-1, :3]
-    commanded = episodes["agent_pos"][..., :3]
-    torch.testing.assert_close(
-        commanded[:, 1:] - commanded[:, :-1], episodes["action"][:, :-1], atol=1e-6, rtol=0
-    )
-    # The cart moves by the mean of the last and the present commanded velocity: P_{t+1} follows a_t.
-    mean = (episodes["action"][:, :-1] + torch.cat([0 * moved[:, :1], episodes["action"][:, :-2]], 1)) / 2
-    torch.testing.assert_close(moved, mean, atol=2e-6, rtol=0)
-    off_by_one = (episodes["action"][:, 1:] + episodes["action"][:, :-1]) / 2
-    assert (moved - off_by_one).abs().max() > 1e-4
-
-
-def test_next_columns_come_after_the_action(recording):
-    after = load_dataset(recording)["next"]
-    assert after["done"][:, -1].all()
-    assert not after["done"][:, :-1].any()
-    assert after["success"][:, -1].all()
-    assert not after["success"][:, :-1].any()
-
-
 def test_metadata_tells_how_every_episode_was_made(recording):
     meta = load_meta(recording)
     assert (meta["format"], meta["task"], meta["kind"]) == (1, "balance_reaching", "demonstrations")
+    assert meta["expert"] == "balance_reaching"
     assert meta["splits"] == {"train": [0, 4], "eval": [4, 6]}
     rows = meta["episodes"]
     assert [row["episode_index"] for row in rows] == list(range(6))
@@ -226,6 +171,18 @@ def test_a_complete_recording_is_left_as_it_is(recording):
     assert [p.name for p in recording.parent.iterdir()] == [recording.name]
 
 
+def test_a_recording_that_names_no_expert_is_of_the_shipped_one(recording, tmp_path):
+    """As the first ones were written."""
+    root = shutil.copytree(recording, tmp_path / "old")
+    meta = load_meta(root)
+    del meta["expert"]
+    write_json(root / module.META, meta)
+    assert record_dataset(root, episodes=4, eval_episodes=2) == root
+    assert record_dataset(root, episodes=4, eval_episodes=2, expert="balance_reaching") == root
+    with pytest.raises(ValueError, match="expert: balance_reaching there, bin_dropping here"):
+        record_dataset(root, episodes=4, eval_episodes=2, expert="bin_dropping")
+
+
 def test_exploration_keeps_every_episode_and_has_scenes_of_its_own(tmp_path):
     root = record_dataset(
         tmp_path / "exploration", kind="exploration", episodes=2, eval_episodes=1, workers=1
@@ -239,7 +196,8 @@ def test_exploration_keeps_every_episode_and_has_scenes_of_its_own(tmp_path):
 def test_failures_are_replaced_by_the_next_candidates(tmp_path, monkeypatch):
     rolled = []
 
-    def roll_out(task, plans):
+    def roll_out(task, plans, expert):
+        assert (task, expert) == ("balance_reaching", "bin_dropping")
         rolled.append([plan.scene_seed for plan in plans])
         success = torch.tensor([plan.scene_seed % 3 == 0 for plan in plans])
         flags = torch.zeros(len(plans), 120, 1, dtype=torch.bool)
@@ -247,9 +205,12 @@ def test_failures_are_replaced_by_the_next_candidates(tmp_path, monkeypatch):
         return TensorDict({("next", "is_success"): flags}, [len(plans), 120])
 
     monkeypatch.setattr(module, "roll_out", roll_out)
-    shard = module.Shard(tmp_path, "balance_reaching", "demonstrations", "train", number=2, count=5)
+    names = {"task": "balance_reaching", "expert": "bin_dropping", "kind": "demonstrations", "split": "train"}
+    shard = module.Shard(tmp_path, **names, number=2, count=5)
+    checkpoints = list_checkpoints("bin_dropping")
     plans, episodes = module._roll_out_shard(shard)
     assert [plan.scene_seed for plan in plans] == [501, 504, 507, 510, 513]
+    assert [plan.checkpoint for plan in plans] == [checkpoints[i % 5] for i in (1, 4, 2, 0, 3)]
     assert episodes.shape == (5, 120)
     assert [seed for batch in rolled for seed in batch] == list(range(500, 500 + sum(map(len, rolled))))
     monkeypatch.setattr(module, "CANDIDATES_PER_SHARD", 10)
@@ -258,7 +219,8 @@ def test_failures_are_replaced_by_the_next_candidates(tmp_path, monkeypatch):
 
 
 def test_shards_never_share_a_scene(tmp_path):
-    settings = {"task": "balance_reaching", "kind": "demonstrations", "episodes": 60, "eval_episodes": 30}
+    settings = {"task": "balance_reaching", "expert": "balance_reaching", "kind": "demonstrations"}
+    settings |= {"episodes": 60, "eval_episodes": 30}
     shards = module._plan_shards(tmp_path, settings)
     assert [s.count for s in shards] == [25, 25, 10, 25, 5]
     seeds = [
@@ -275,6 +237,8 @@ def test_shards_never_share_a_scene(tmp_path):
         ({"kind": "something"}, "unknown kind"),
         ({"task": "something"}, "unknown task"),
         ({"eval_episodes": 0}, "at least one episode"),
+        ({"expert": "bin_dropping"}, "expert: balance_reaching there, bin_dropping here"),
+        ({"expert": "something"}, "no expert at something"),
     ],
 )
 def test_other_settings_are_refused(recording, changes, message):
@@ -290,10 +254,11 @@ def test_a_folder_with_something_else_is_refused(tmp_path):
         record_dataset(tmp_path / "thesis.tex" / "dataset")
 
 
-def test_unfinished_shards_of_other_settings_are_refused(tmp_path):
+@pytest.mark.parametrize("expert", [{"expert": "balance_reaching"}, {}], ids=["named", "as of old"])
+def test_unfinished_shards_of_other_settings_are_refused(tmp_path, expert):
     write_json(
         tmp_path / "d.parts" / "settings.json",
-        {"task": "balance_reaching", "kind": "exploration", "episodes": 4, "eval_episodes": 2},
+        {"task": "balance_reaching", "kind": "exploration", "episodes": 4, "eval_episodes": 2, **expert},
     )
     with pytest.raises(ValueError, match="kind: exploration there"):
         record_dataset(tmp_path / "d", episodes=4, eval_episodes=2)

@@ -1,6 +1,7 @@
 """The Gymnasium ids, used as Gymnasium's users use them."""
 
 import warnings
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -9,26 +10,39 @@ from gymnasium.utils.env_checker import check_env
 
 import dynmap_rl  # noqa: F401 (registers the ids)
 from dynmap_rl.envs.gymnasium_env import OBS_TYPES, DynmapEnv
-from dynmap_rl.envs.scene import Scene, SceneRanges
+from dynmap_rl.envs.tasks import TASKS, get_task
 from dynmap_rl.envs.world import EPISODE_STEPS
 
-ID = "dynmap_rl/BalanceReaching-v0"
+IDS = {
+    "balance_reaching": "dynmap_rl/BalanceReaching-v0",
+    "balance_reaching_obstacle": "dynmap_rl/BalanceReachingObstacle-v0",
+    "bin_dropping": "dynmap_rl/BinDropping-v0",
+}
 STILL = np.zeros(3, dtype=np.float32)
 HARD = {"position": [0.02, 0.02, 0.05], "acceleration": [3.0, 3.0, 10.0]}
 
 
-def make(**arguments) -> gym.Env:
-    return gym.make(ID, **arguments).unwrapped
+every_task = pytest.mark.parametrize("task", IDS)
 
 
+def make(task="balance_reaching", **arguments) -> gym.Env:
+    return gym.make(IDS[task], **arguments).unwrapped
+
+
+def test_every_task_has_its_id():
+    assert set(IDS) == set(TASKS)
+    assert {name: make(name).task.name for name in IDS} == {name: name for name in IDS}
+
+
+@every_task
 @pytest.mark.parametrize("obs_type", OBS_TYPES)
 @pytest.mark.parametrize("control", HARD)
-def test_passes_gymnasiums_own_check(obs_type, control):
+def test_passes_gymnasiums_own_check(task, obs_type, control):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         if control == "acceleration":  # in SI units, as the experts act, not scaled to [-1, 1]
             warnings.filterwarnings("ignore", message=".*recommend using a symmetric and normalized space")
-        check_env(make(obs_type=obs_type, control=control, render_mode="rgb_array"))
+        check_env(make(task, obs_type=obs_type, control=control, render_mode="rgb_array"))
 
 
 @pytest.mark.parametrize("control", HARD)
@@ -36,9 +50,10 @@ def test_action_space_is_the_carts_limits(control):
     np.testing.assert_allclose(make(control=control).action_space.high, HARD[control])
 
 
+@every_task
 @pytest.mark.parametrize("obs_type", OBS_TYPES)
-def test_observations_lie_in_their_space(obs_type):
-    env = make(obs_type=obs_type)
+def test_observations_lie_in_their_space(task, obs_type):
+    env = make(task, obs_type=obs_type)
     env.action_space.seed(0)
     observation, _ = env.reset(seed=0)
     for _ in range(EPISODE_STEPS):
@@ -46,37 +61,53 @@ def test_observations_lie_in_their_space(obs_type):
         observation, *_ = env.step(env.action_space.sample())
 
 
-def test_agent_pos_is_command_and_goal():
-    env = make(obs_type="pixels_agent_pos")
+@every_task
+def test_agent_pos_is_command_and_goal(task):
+    env = make(task, obs_type="pixels_agent_pos")
     observation, _ = env.reset(options={"cart_x": 0.3, "cart_y": 0.2, "goal_x": 0.7, "goal_y": 0.5})
     np.testing.assert_allclose(observation["agent_pos"], [0.3, 0.2, 0.0, 0.7, 0.5], atol=1e-7)
     observation, *_ = env.step(np.array([0.004, 0.002, 0.01]))
     np.testing.assert_allclose(observation["agent_pos"], [0.304, 0.202, 0.01, 0.7, 0.5], atol=1e-7)
 
 
-def test_reset_options_fix_factors_and_leave_the_others_drawn():
-    env = make()
+@every_task
+def test_reset_options_fix_factors_and_leave_the_others_drawn(task):
+    env, default = make(task), get_task(task).ranges.scene()
     env.reset(seed=3)
     drawn = env.world.scene
     env.reset(seed=3, options={"cart_x": 0.31, "block_color": [0, 0, 90]})
     assert env.world.scene == drawn.replace(cart_x=0.31, block_color=(0, 0, 90))
-    env.reset(options=Scene().to_dict())
-    assert env.world.scene == Scene()
+    env.reset(options=default.to_dict())
+    assert env.world.scene == default
     with pytest.raises(ValueError, match="colour"):
         env.reset(options={"colour": 1})
 
 
-def test_seed_determines_every_scene_that_follows():
+@every_task
+def test_seed_determines_every_scene_that_follows(task):
     def starts(seed):
-        env = make()
+        env = make(task)
         return [env.reset(seed=seed)[0], env.reset()[0], env.reset()[0]]
 
     np.testing.assert_array_equal(starts(5), starts(5))
     assert len(np.unique([*starts(5), *starts(6)], axis=0)) == 6
 
 
-def test_ranges_are_a_parameter():
-    env = make(ranges=SceneRanges(cart_width=(0.4, 0.5)))
+@every_task
+def test_seed_and_actions_determine_the_trajectory(task):
+    def play(seed):
+        env = make(task)
+        env.action_space.seed(0)
+        start, _ = env.reset(seed=seed)
+        return [start] + [env.step(env.action_space.sample())[0] for _ in range(40)]
+
+    np.testing.assert_array_equal(play(2), play(2))
+    assert not np.array_equal(play(2), play(3))
+
+
+@every_task
+def test_ranges_are_a_parameter(task):
+    env = make(task, ranges=replace(get_task(task).ranges, cart_width=(0.4, 0.5)))
     for seed in range(5):
         env.reset(seed=seed)
         assert 0.4 <= env.world.scene.cart_width <= 0.5
@@ -105,31 +136,34 @@ def test_drop_terminates_without_success():
     assert info["dropped"] and not info["is_success"]
 
 
-def test_info_holds_numpy_scalars():
-    env = make()
+@every_task
+def test_info_holds_numpy_scalars(task):
+    env = make(task)
     _, info = env.reset(seed=0)
     for values in (info, env.step(STILL)[-1]):
-        assert set(values) == {"is_success", "dropped", "position_error"}
+        assert set(values) == {"is_success", "dropped", "touched", "position_error"}
         assert all(isinstance(value, np.generic) for value in values.values())
 
 
-def test_render_has_the_size_asked_for_and_shows_the_observed_scene():
-    env = make(obs_type="pixels", render_mode="rgb_array", render_size=96)
+@every_task
+def test_render_has_the_size_asked_for_and_shows_the_observed_scene(task):
+    env = make(task, obs_type="pixels", render_mode="rgb_array", render_size=96)
     observation, _ = env.reset(seed=0)
     assert env.render().shape == (96, 96, 3)
     assert env.render().flags.writeable and observation.flags.writeable
-    same_size = make(obs_type="pixels", render_mode="rgb_array", render_size=64)
+    same_size = make(task, obs_type="pixels", render_mode="rgb_array", render_size=64)
     same_size.reset(seed=0)
     np.testing.assert_array_equal(same_size.render(), observation)
 
 
-def test_vector_environment_equals_single_ones():
-    vector = gym.make_vec(ID, num_envs=2, vectorization_mode="sync")
+@every_task
+def test_vector_environment_equals_single_ones(task):
+    vector = gym.make_vec(IDS[task], num_envs=2, vectorization_mode="sync")
     states = [vector.reset(seed=[4, 5])[0]]
     action = np.array([[0.005, 0.002, 0.0], [-0.005, 0.001, 0.01]], dtype=np.float32)
     states += [vector.step(action)[0] for _ in range(10)]
     for i in range(2):
-        env = make()
+        env = make(task)
         single = [env.reset(seed=4 + i)[0]] + [env.step(action[i])[0] for _ in range(10)]
         np.testing.assert_array_equal(np.array(states)[:, i], single)
 

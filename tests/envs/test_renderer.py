@@ -6,8 +6,8 @@ import pytest
 
 from dynmap_rl.envs.renderer import Renderer, box
 from dynmap_rl.envs.scene import GOAL_COLOR, Scene
-from dynmap_rl.envs.tasks import get_task
-from dynmap_rl.envs.world import World
+from dynmap_rl.envs.tasks import TASKS, get_task
+from dynmap_rl.envs.world import WALL, World
 
 TASK = get_task("balance_reaching")
 SCENE = Scene(cart_x=0.3, cart_y=0.3, goal_x=0.8, goal_y=0.7)
@@ -23,17 +23,56 @@ def centroid(frame: np.ndarray, color) -> np.ndarray:
     return np.argwhere((frame == color).all(-1)).mean(0)
 
 
-def test_frame_format():
-    frame = draw()
+@pytest.mark.parametrize("name", TASKS)
+def test_frame_format(name):
+    task = get_task(name)
+    frame = Renderer().draw(task.make_world(task.ranges.scene()), task)
     assert frame.shape == (64, 64, 3)
     assert frame.dtype == np.uint8
 
 
-def test_background_and_four_flat_colours():
-    frame = draw()
-    assert tuple(frame[0, 0]) == SCENE.background_color
+@pytest.mark.parametrize("name", TASKS)
+def test_background_and_three_flat_colours_with_markers_in_green(name):
+    task = get_task(name)
+    scene = task.ranges.scene()
+    frame = Renderer().draw(task.make_world(scene), task)
+    assert tuple(frame[0, 0]) == scene.background_color
     colors = {tuple(map(int, c)) for c in frame.reshape(-1, 3)}
-    assert colors == {SCENE.background_color, SCENE.cart_color, SCENE.block_color, GOAL_COLOR}
+    assert colors == {scene.background_color, scene.cart_color, scene.block_color, (0, 200, 0)}
+
+
+@pytest.mark.parametrize("name", ["balance_reaching_obstacle", "bin_dropping"])
+@pytest.mark.parametrize("seed", range(3))
+def test_walls_are_drawn_where_they_stand(name, seed):
+    """Green is what lies in a wall of the world; a pixel's width is left open."""
+    task, size = get_task(name), 256
+    scene = task.sample_scene(np.random.default_rng(seed)).replace(cart_x=0.12, cart_y=0.85, goal_x=0.8)
+    world = task.make_world(scene)
+    walls = [s for s in world.space.static_body.shapes if s.collision_type == WALL]
+    green = (Renderer(size).draw(world, task) == GOAL_COLOR).all(-1)
+    inside, outside = np.zeros_like(green), np.zeros_like(green)
+    for row in range(size):
+        for column in range(size):
+            point = (column + 0.5) / size, 1 - (row + 0.5) / size
+            distance = min(wall.point_query(point).distance for wall in walls)
+            inside[row, column] = distance < -1 / size
+            outside[row, column] = distance > 2 / size
+    if name == "balance_reaching_obstacle":  # its goal is drawn as well
+        rows, columns = np.indices(green.shape)
+        goal = np.hypot(columns / size - scene.goal_x, 1 - rows / size - scene.goal_y) < 0.04
+        outside &= ~goal
+    assert inside.sum() > 50
+    assert green[inside].all()
+    assert not green[outside].any()
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_cart_and_block_are_drawn_before_the_markers(name):
+    task = get_task(name)
+    scene = task.ranges.scene(cart_x=0.5, cart_y=0.5, goal_x=0.5, goal_y=0.5)
+    frame = Renderer().draw(task.make_world(scene), task)
+    assert tuple(frame[31, 31]) == scene.cart_color
+    assert tuple(frame[32 - 5, 31]) == scene.block_color
 
 
 @pytest.mark.parametrize("size", [64, 256])
@@ -67,15 +106,17 @@ def test_box_is_turned_counterclockwise_about_its_centre():
     np.testing.assert_allclose(box(0.5, 0.3, angle, 0.4, 0.2), level @ turn.T + [0.5, 0.3])
 
 
-def test_drawing_leaves_the_world_alone():
-    watched, unwatched = World(SCENE), World(SCENE)
+@pytest.mark.parametrize("name", TASKS)
+def test_drawing_leaves_the_world_alone(name):
+    task = get_task(name)
+    watched, unwatched = (task.make_world(task.ranges.scene()) for _ in range(2))
     renderer = Renderer()
     for i in range(20):
         action = np.array([0.01 * np.sin(i), 0.005, 0.002])
         watched.step(action)
         unwatched.step(action)
-        first = renderer.draw(watched, TASK)
-        np.testing.assert_array_equal(first, renderer.draw(watched, TASK))
+        first = renderer.draw(watched, task)
+        np.testing.assert_array_equal(first, renderer.draw(watched, task))
         np.testing.assert_array_equal(watched.position, unwatched.position)
 
 

@@ -6,18 +6,57 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from dynmap_rl.envs.scene import SEEDS_PER_SPLIT, SPLITS, Scene, SceneRanges, sample_scene, scene_seed
+from dynmap_rl.envs.scene import (
+    SEEDS_PER_SPLIT,
+    SPLITS,
+    BinRanges,
+    BinScene,
+    ObstacleRanges,
+    ObstacleScene,
+    Scene,
+    SceneRanges,
+    sample_scene,
+    scene_seed,
+)
 
-NUMBERS = [f.name for f in fields(Scene) if not f.name.endswith("color")]
+every_kind = pytest.mark.parametrize("ranges", [SceneRanges(), ObstacleRanges(), BinRanges()])
 
 
 def scenes(ranges: SceneRanges | None = None, count: int = 200) -> list[Scene]:
     return [sample_scene(np.random.default_rng(seed), ranges) for seed in range(count)]
 
 
-def test_seed_determines_the_scene():
-    assert scenes(count=50) == scenes(count=50)
-    assert len(set(scenes(count=50))) == 50
+@every_kind
+def test_seed_determines_the_scene(ranges):
+    assert scenes(ranges, 50) == scenes(ranges, 50)
+    assert len(set(scenes(ranges, 50))) == 50
+
+
+def test_scenes_of_task_1_are_those_of_the_published_results():
+    scene = sample_scene(np.random.default_rng(scene_seed("test", 0)))
+    assert scene == Scene(
+        cart_width=0.23918399024325496,
+        cart_height=0.04,
+        block_width=0.06,
+        block_height=0.16144137880609483,
+        block_shift=-0.01563183817184643,
+        cart_x=0.370463200863278,
+        cart_y=0.5535727611022035,
+        goal_x=0.19316864092752445,
+        goal_y=0.32173098107919573,
+        friction=0.8,
+        density=100.0,
+        cart_color=(79, 59, 70),
+        block_color=(67, 126, 118),
+        background_color=(193, 236, 214),
+    )
+
+
+@pytest.mark.parametrize(
+    ("ranges", "kind"), [(SceneRanges(), Scene), (ObstacleRanges(), ObstacleScene), (BinRanges(), BinScene)]
+)
+def test_ranges_draw_scenes_of_their_task(ranges, kind):
+    assert {type(scene) for scene in scenes(ranges, 5)} == {kind}
 
 
 @pytest.mark.parametrize(
@@ -27,11 +66,13 @@ def test_seed_determines_the_scene():
         SceneRanges(
             cart_width=(0.4, 0.5), friction=(0.2, 0.9), object_color=(0, 50), background_color=(90, 99)
         ),
+        ObstacleRanges(obstacle_x=(0.4, 0.6), obstacle_y=(0.3, 0.5), obstacle_length=(0.1, 0.3)),
+        BinRanges(),
     ],
 )
 def test_ranges_are_respected_and_filled(ranges):
     drawn = scenes(ranges)
-    for name in NUMBERS:
+    for name in [f.name for f in fields(ranges.scene) if not f.name.endswith("color")]:
         low, high = getattr(ranges, name)
         values = np.array([getattr(scene, name) for scene in drawn])
         assert low <= values.min() and values.max() <= high
@@ -45,8 +86,9 @@ def test_ranges_are_respected_and_filled(ranges):
         assert values.min() == low and values.max() == high
 
 
-def test_start_is_away_from_the_goal_and_objects_differ():
-    for scene in scenes():
+@every_kind
+def test_start_is_away_from_the_goal_and_objects_differ(ranges):
+    for scene in scenes(ranges):
         assert np.hypot(scene.cart_x - scene.goal_x, scene.cart_y - scene.goal_y) >= 0.2
         assert np.linalg.norm(np.subtract(scene.cart_color, scene.block_color)) >= 60
 
@@ -70,15 +112,17 @@ def test_unknown_split_or_index_raises(split, index):
         scene_seed(split, index)
 
 
-def test_every_factor_can_be_fixed():
-    drawn = scenes(count=2)
+@every_kind
+def test_every_factor_can_be_fixed(ranges):
+    drawn = scenes(ranges, 2)
     assert drawn[0].replace(**drawn[1].to_dict()) == drawn[1]
     assert Scene().replace(block_color=[1, 2, 3]).block_color == (1, 2, 3)
 
 
-def test_scene_survives_its_dict():
-    scene = scenes(count=1)[0]
-    assert Scene.from_dict(scene.to_dict()) == scene
+@every_kind
+def test_scene_survives_its_dict(ranges):
+    scene = scenes(ranges, 1)[0]
+    assert ranges.scene.from_dict(scene.to_dict()) == scene
 
 
 def test_unknown_factor_raises():
@@ -86,7 +130,17 @@ def test_unknown_factor_raises():
         Scene().replace(cart_z=0.1)
 
 
-@pytest.mark.parametrize("factor", [{"block_width": 0.0}, {"density": -1.0}, {"block_shift": 0.2}])
-def test_impossible_scene_raises(factor):
+@pytest.mark.parametrize(
+    ("kind", "factor"),
+    [
+        (Scene, {"block_width": 0.0}),
+        (Scene, {"density": -1.0}),
+        (Scene, {"block_shift": 0.2}),
+        (ObstacleScene, {"obstacle_length": 0.0}),
+        (BinScene, {"bin_width": -0.1}),
+        (BinScene, {"bin_depth": 0.0}),
+    ],
+)
+def test_impossible_scene_raises(kind, factor):
     with pytest.raises(ValueError, match=next(iter(factor))):
-        Scene(**factor)
+        kind(**factor)

@@ -1,14 +1,22 @@
-"""Task 1: its reward, its success, and the state its experts see."""
+"""What holds for every task; and task 1: its reward, its success, and the state its experts see."""
 
 import numpy as np
 import pytest
 
-from dynmap_rl.envs.scene import Scene
-from dynmap_rl.envs.tasks import MARKER_SIZE, get_task
+from dynmap_rl.envs import DynmapBatchedEnv, DynmapEnv
+from dynmap_rl.envs.scene import BinRanges, ObstacleRanges, Scene, SceneRanges
+from dynmap_rl.envs.tasks import MARKER_SIZE, TASKS, choose_ranges, get_task
 from dynmap_rl.envs.world import EPISODE_STEPS, World
 
 TASK = get_task("balance_reaching")
 STILL = np.zeros(3)
+REWARDS = {  # what each says of its range
+    "balance_reaching": (-0.2, 1.0),
+    "balance_reaching_obstacle": (-1.0, 1.15),
+    "bin_dropping": (-1.0, 1.0),
+}
+
+every_task = pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 
 
 def world_at(distance: float, **factors) -> World:
@@ -22,9 +30,97 @@ def after_episode(world: World) -> World:
     return world
 
 
-def test_unknown_task_names_the_known_ones():
-    with pytest.raises(ValueError, match="balance_reaching"):
+# Every task
+
+
+@pytest.mark.parametrize("known", TASKS)
+def test_unknown_task_names_the_known_ones(known):
+    with pytest.raises(ValueError, match=f"'{known}'"):
         get_task("nope")
+
+
+@every_task
+def test_reward_stays_in_its_range_for_wild_actions(task):
+    rng = np.random.default_rng(0)
+    low, high = REWARDS[task.name]
+    for seed in range(3):
+        world = task.make_world(task.sample_scene(np.random.default_rng(seed), None))
+        for _ in range(60):
+            world.step(rng.normal(size=3))
+            assert low <= task.reward(world) <= high
+
+
+@every_task
+def test_state_is_finite_and_bounded_even_after_a_drop(task):
+    rng = np.random.default_rng(0)
+    world = task.make_world(task.ranges.scene(block_height=0.2))
+    for _ in range(EPISODE_STEPS):
+        world.step(rng.normal(size=3))
+        state = task.state(world)
+        assert state.shape == (task.state_size,) and state.dtype == np.float32
+        assert (np.abs(state) <= 10).all()
+    assert world.dropped
+
+
+@every_task
+def test_state_knows_no_colours(task):
+    scene = task.ranges.scene()
+    colored = scene.replace(cart_color=(200, 0, 0), block_color=(0, 9, 9), background_color=(0, 0, 0))
+    plain, red = task.make_world(scene), task.make_world(colored)
+    np.testing.assert_array_equal(task.state(plain), task.state(red))
+
+
+@every_task
+def test_state_begins_as_that_of_task_1_behind_the_goal(task):
+    world = task.make_world(task.ranges.scene())
+    for _ in range(10):
+        world.accelerate([1.0, 0.5, 0.5])
+    np.testing.assert_array_equal(task.state(world)[2:16], TASK.state(world)[2:16])
+
+
+@every_task
+def test_policies_are_given_the_scenes_goal(task):
+    scene = task.sample_scene(np.random.default_rng(0))
+    np.testing.assert_array_equal(task.goal(task.make_world(scene)), [scene.goal_x, scene.goal_y])
+
+
+@every_task
+def test_no_start_is_solved_or_lost(task):
+    for seed in range(100):
+        world = task.make_world(task.sample_scene(np.random.default_rng(seed)))
+        for _ in range(2):
+            assert not task.is_success(world) and not task.is_over(world)
+            world.step(STILL)
+        assert world.touched == set() and not world.dropped
+
+
+@pytest.mark.parametrize("make", [DynmapEnv, DynmapBatchedEnv])
+@pytest.mark.parametrize(
+    ("task", "ranges", "needed"),
+    [
+        ("bin_dropping", SceneRanges(), "BinRanges"),
+        ("bin_dropping", ObstacleRanges(), "BinRanges"),
+        ("balance_reaching_obstacle", SceneRanges(), "ObstacleRanges"),
+        ("balance_reaching_obstacle", BinRanges(), "ObstacleRanges"),
+    ],
+)
+def test_ranges_of_another_task_raise(make, task, ranges, needed):
+    with pytest.raises(ValueError, match=f"{task} needs {needed}, not {type(ranges).__name__}"):
+        make(task, ranges=ranges)
+
+
+@every_task
+def test_own_ranges_are_the_default(task):
+    assert choose_ranges(task, None) is task.ranges
+    assert isinstance(task.sample_scene(np.random.default_rng(0)), task.ranges.scene)
+
+
+# Task 1
+
+
+def test_task_1_takes_scenes_with_more_in_them():
+    assert isinstance(TASK.sample_scene(np.random.default_rng(0), BinRanges()), Scene)
+    DynmapEnv(ranges=ObstacleRanges()).reset(seed=0)
 
 
 def test_reward_grows_towards_the_goal():
@@ -48,15 +144,6 @@ def test_dropped_block_earns_nothing():
     assert TASK.reward(world) == 0
 
 
-def test_reward_stays_in_its_range_for_wild_actions():
-    rng = np.random.default_rng(0)
-    for seed in range(3):
-        world = World(TASK.sample_scene(np.random.default_rng(seed), None))
-        for _ in range(60):
-            world.step(rng.normal(size=3))
-            assert -0.2 <= TASK.reward(world) <= 1
-
-
 @pytest.mark.parametrize("distance, success", [(0.0, True), (0.049, True), (0.051, False)])
 def test_success_is_a_final_error_under_50_mm(distance, success):
     assert TASK.is_success(after_episode(world_at(distance))) is success
@@ -73,27 +160,11 @@ def test_no_success_before_the_last_step_or_after_a_drop():
     assert not TASK.is_success(world)
 
 
-def test_state_is_finite_and_bounded_even_after_a_drop():
-    rng = np.random.default_rng(0)
-    world = World(Scene(block_height=0.2))
-    for _ in range(EPISODE_STEPS):
-        world.step(rng.normal(size=3))
-        state = TASK.state(world)
-        assert state.shape == (TASK.state_size,) and state.dtype == np.float32
-        assert (np.abs(state) <= 10).all()
-    assert world.dropped
-
-
 def test_state_of_a_resting_world():
     state = TASK.state(world_at(0.25, cart_width=0.25, block_height=0.16, block_shift=0.02))
     expected = np.zeros(16)
     expected[[0, 2, 3, 8]] = 0.5, -0.4, -0.2, 0.2  # goal, cart, block's shift
     np.testing.assert_allclose(state, expected, atol=1e-6)
-
-
-def test_state_knows_no_colours():
-    plain, red = world_at(0.3), world_at(0.3, cart_color=(200, 0, 0), background_color=(0, 0, 0))
-    np.testing.assert_array_equal(TASK.state(plain), TASK.state(red))
 
 
 def test_marker_is_a_square_at_the_goal():

@@ -1,5 +1,7 @@
 """The batched TorchRL environment: its specs, its resets, and its agreement with the Gymnasium ids."""
 
+from dataclasses import replace
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -8,8 +10,11 @@ from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs.utils import check_env_specs
 
-import dynmap_rl  # noqa: F401 (registers the ids)
-from dynmap_rl.envs import DynmapBatchedEnv, SceneRanges
+from dynmap_rl import GYMNASIUM_IDS
+from dynmap_rl.envs import DynmapBatchedEnv
+from dynmap_rl.envs.tasks import TASKS
+
+every_task = pytest.mark.parametrize("task", TASKS)
 
 LIMIT = {"position": [0.02, 0.02, 0.05], "acceleration": [3.0, 3.0, 10.0]}
 
@@ -30,6 +35,7 @@ def random_actions(count: int, steps: int, control: str = "position") -> torch.T
     return (2 * torch.rand(count, steps, 3, generator=generator) - 1) * torch.tensor(LIMIT[control])
 
 
+@every_task
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -39,25 +45,30 @@ def random_actions(count: int, steps: int, control: str = "position") -> torch.T
         {"num_envs": 2, "from_pixels": True, "control": "acceleration"},
     ],
 )
-def test_specs(arguments):
-    check_env_specs(DynmapBatchedEnv(**arguments), seed=0)
+def test_specs(task, arguments):
+    check_env_specs(DynmapBatchedEnv(task, **arguments), seed=0)
 
 
-def test_reward_and_flags_have_a_trailing_dimension():
-    env = DynmapBatchedEnv(num_envs=4)
-    step = env.rollout(1)[:, 0]
-    for key in ("reward", "done", "terminated", "truncated", "is_success", "dropped", "position_error"):
-        assert step["next", key].shape == (4, 1)
+@every_task
+def test_reward_and_flags_have_a_trailing_dimension(task):
+    env = DynmapBatchedEnv(task, num_envs=4)
+    step = env.rollout(1)[:, 0]["next"]
+    for key in ("reward", "done", "terminated", "truncated"):
+        assert step[key].shape == (4, 1)
+    for key in ("is_success", "dropped", "touched", "position_error"):
+        assert step[key].shape == (4, 1)
 
 
+@every_task
 @pytest.mark.parametrize("control", LIMIT)
-def test_same_trajectory_as_gymnasium(control):
+def test_same_trajectory_as_gymnasium(task, control):
     seeds, actions = [0, 7, 123_456_789], random_actions(3, 40, control)
-    batched = DynmapBatchedEnv(num_envs=3, from_pixels=True, control=control)
+    batched = DynmapBatchedEnv(task, num_envs=3, from_pixels=True, control=control)
     start, steps = seeded(batched, seeds), play(batched, seeds, actions)
+    gymnasium_id = next(name for name, its_task in GYMNASIUM_IDS.items() if its_task == task)
     for i, seed in enumerate(seeds):
         arguments = {"obs_type": "pixels_agent_pos", "control": control}
-        env = gym.make("dynmap_rl/BalanceReaching-v0", **arguments).unwrapped
+        env = gym.make(gymnasium_id, **arguments).unwrapped
         observation, _ = env.reset(seed=seed)
         same_observation(start[i], observation, env)
         for t in range(40):
@@ -78,16 +89,18 @@ def same_observation(td: TensorDict, observation: dict, env: gym.Env) -> None:
         np.testing.assert_array_equal(td["dynamics", name], getattr(env.world, name).astype(np.float32))
 
 
-def test_number_of_worlds_does_not_matter():
+@every_task
+def test_number_of_worlds_does_not_matter(task):
     actions = random_actions(8, 30)
-    together = play(DynmapBatchedEnv(num_envs=8, from_pixels=True), range(8), actions)
-    alone = DynmapBatchedEnv(num_envs=1, from_pixels=True)
+    together = play(DynmapBatchedEnv(task, num_envs=8, from_pixels=True), range(8), actions)
+    alone = DynmapBatchedEnv(task, num_envs=1, from_pixels=True)
     for i in range(8):
         assert (play(alone, [i], actions[i : i + 1])[0] == together[i]).all()
 
 
-def test_partial_reset_touches_only_the_masked_worlds():
-    env = DynmapBatchedEnv(num_envs=3, seed=0)
+@every_task
+def test_partial_reset_touches_only_the_masked_worlds(task):
+    env = DynmapBatchedEnv(task, num_envs=3, seed=0)
     td = env.rollout(5)[:, -1]["next"].exclude("reward")
     worlds = list(env.worlds)
     mask = torch.tensor([[False], [True], [False]])
@@ -112,8 +125,10 @@ def test_seed_determines_every_scene_that_follows():
     assert len(first.reshape(-1, 2).unique(dim=0)) == 4
 
 
-def test_ranges_are_a_parameter():
-    env = DynmapBatchedEnv(num_envs=5, ranges=SceneRanges(cart_width=(0.4, 0.5)))
+@every_task
+def test_ranges_are_a_parameter(task):
+    ranges = replace(TASKS[task].ranges, cart_width=(0.4, 0.5))
+    env = DynmapBatchedEnv(task, num_envs=5, ranges=ranges)
     env.reset()
     assert all(0.4 <= world.scene.cart_width <= 0.5 for world in env.worlds)
 

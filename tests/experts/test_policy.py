@@ -1,5 +1,8 @@
 """The shipped experts: complete, deterministic, and good at their task."""
 
+import shutil
+
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -7,32 +10,58 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from dynmap_rl.envs import DynmapBatchedEnv, scene_seed
+from dynmap_rl.envs.tasks import TASKS, get_task
 from dynmap_rl.envs.world import ACCELERATION_LIMIT
-from dynmap_rl.experts import ExpertNetwork, list_checkpoints, load_expert, make_actor
+from dynmap_rl.experts import ExpertNetwork, list_checkpoints, load_expert, make_actor, roll_out
 from dynmap_rl.experts.policy import CHECKPOINTS
 from dynmap_rl.runs import read_json
 
 TASK = "balance_reaching"
 LIMIT = (3.0, 3.0, 10.0)
+SHIPPED = sorted((path.parent.name, path.stem) for path in CHECKPOINTS.glob("*/*.safetensors"))
 
 
-def test_last_checkpoint_succeeds_on_fresh_scenes():
-    env = DynmapBatchedEnv(TASK, num_envs=10, control="acceleration")
-    seeds = torch.tensor([scene_seed("exploration", i) for i in range(10)])
-    policy = TensorDictModule(load_expert(TASK), in_keys=["state"], out_keys=["action", "scale"])
-    start = env.reset(TensorDict({"scene_seed": seeds}, [10]))
-    rollout = env.rollout(120, policy, auto_reset=False, tensordict=start, break_when_any_done=False)
-    assert rollout["next", "is_success"][:, -1].sum() >= 9
+@pytest.mark.parametrize("task", TASKS)
+def test_last_checkpoint_succeeds_on_fresh_scenes(task):
+    seeds = [scene_seed("exploration", 20_000_000 + i) for i in range(100)]
+    worlds = roll_out(load_expert(task), get_task(task), seeds)
+    assert sum(get_task(task).is_success(world) for world in worlds) >= 95
 
 
-@pytest.mark.parametrize("checkpoint", list_checkpoints(TASK))
-def test_every_checkpoint_loads_and_has_its_facts(checkpoint):
-    facts = read_json(CHECKPOINTS / TASK / f"{checkpoint}.json")
-    assert facts["task"] == TASK
+@pytest.mark.parametrize("task", TASKS)
+def test_rollout_is_that_of_the_environment(task):
+    """Past the end of an episode that is over early, too."""
+    seeds, network = [scene_seed("exploration", i) for i in range(4)], load_expert(task)
+    worlds = roll_out(network, get_task(task), seeds)
+    env = DynmapBatchedEnv(task, num_envs=4, control="acceleration")
+    policy = TensorDictModule(network, in_keys=["state"], out_keys=["action", "scale"])
+    td = env.reset(TensorDict({"scene_seed": torch.tensor(seeds)}, [4]))
+    for _ in range(120):
+        td = env.step(policy(td))["next"].exclude("reward")
+    for world, row in zip(worlds, td, strict=True):
+        np.testing.assert_array_equal(row["dynamics", "position"], world.position.astype(np.float32))
+        assert row["is_success"].item() == get_task(task).is_success(world)
+
+
+@pytest.mark.parametrize("task, checkpoint", SHIPPED)
+def test_every_checkpoint_acts_within_the_carts_limits(task, checkpoint):
+    env = DynmapBatchedEnv(task, num_envs=10, seed=0)
+    start = env.reset()["state"]
+    state = torch.cat([start, 10 * torch.ones_like(start), -10 * torch.ones_like(start)])
+    mean, std = load_expert(task, checkpoint)(state)
+    assert (mean.abs() <= torch.tensor(LIMIT)).all() and (std > 0).all()
+    assert not torch.equal(mean[:10].min(0).values, mean[:10].max(0).values)
+
+
+@pytest.mark.parametrize("task, checkpoint", SHIPPED)
+def test_every_checkpoint_loads_and_has_its_facts(task, checkpoint):
+    facts = read_json(CHECKPOINTS / task / f"{checkpoint}.json")
+    assert facts["task"] == task
+    assert facts["state_size"] == get_task(task).state_size
     assert checkpoint == f"iteration_{facts['iteration']:03d}"
     assert 0 <= facts["drop"] <= 1 and 0 <= facts["success"] <= 1
     assert facts["frames"] > 0 and facts["episodes"] > 0 and facts["position_error"] > 0
-    network = load_expert(TASK, checkpoint)
+    network = load_expert(task, checkpoint)
     assert network.limit.tolist() == ACCELERATION_LIMIT.tolist()
     assert not any(p.requires_grad for p in network.parameters())
 
@@ -44,11 +73,26 @@ def test_last_checkpoint_is_the_default_and_loading_is_deterministic():
     assert not torch.equal(load_expert(TASK, list_checkpoints(TASK)[0])(state)[0], mean)
 
 
-def test_unknown_task_or_checkpoint_raises():
-    with pytest.raises(ValueError, match="no expert is shipped for task 'nope'"):
-        list_checkpoints("nope")
-    with pytest.raises(ValueError, match="no expert is shipped for task 'nope'"):
-        load_expert("nope")
+@pytest.mark.parametrize("as_text", [True, False])
+def test_an_expert_is_also_named_by_its_folder(tmp_path, as_text):
+    first, second = list_checkpoints("bin_dropping")[:2]
+    for path in (CHECKPOINTS / "bin_dropping").glob(f"{first}.*"):
+        shutil.copy(path, tmp_path / f"mine{path.suffix}")
+    folder = str(tmp_path) if as_text else tmp_path
+    assert list_checkpoints(folder) == ["mine"]
+    state = torch.randn(5, 20)
+    mean, _ = load_expert(folder)(state)
+    assert torch.equal(mean, load_expert("bin_dropping", first)(state)[0])
+    with pytest.raises(ValueError, match=f"no checkpoint '{second}'.*mine"):
+        load_expert(folder, second)
+
+
+def test_unknown_expert_or_checkpoint_raises(tmp_path):
+    for nothing in ("nope", tmp_path, tmp_path / "nope", str(tmp_path / "nope")):
+        with pytest.raises(ValueError, match=f"no expert at {nothing}; train one with recipes/expert.py"):
+            list_checkpoints(nothing)
+        with pytest.raises(ValueError, match=f"no expert at {nothing}; train one with recipes/expert.py"):
+            load_expert(nothing)
     with pytest.raises(ValueError, match=f"no checkpoint 'nope'.*{list_checkpoints(TASK)[-1]}"):
         load_expert(TASK, "nope")
 

@@ -1,0 +1,40 @@
+"""Draw figures from datasets.
+
+    python recipes/collect.py && python recipes/collect.py --task bin_dropping
+    python recipes/figures.py
+
+Draws how the angles and angular velocities of tasks are distributed, side by side, and writes their ranges as JSON.
+"""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from dynmap_rl.runs import run_recipe
+
+
+@dataclass
+class Config:
+    # Datasets, folders or hub ids, separated by commas.
+    datasets: str = "datasets/balance_reaching,datasets/balance_reaching_obstacle,datasets/bin_dropping"
+    # Folder of the figures.
+    output: Path = Path("runs/figures")
+
+
+def main(config: Config) -> None:
+    from dynmap_rl.data import load_dataset, load_meta
+    from dynmap_rl.evaluation.figures import plot_distributions
+    from dynmap_rl.runs import write_json
+
+    names = [name.strip() for name in config.datasets.split(",")]
+    dynamics = {load_meta(name)["task"]: load_dataset(name, "train")["dynamics"] for name in names}
+    ranges = plot_distributions(dynamics, config.output / "distributions.png")
+    command = " ".join(["python", *sys.argv])
+    write_json(
+        config.output / "distributions.json", {"command": command, "datasets": names, "ranges": ranges}
+    )
+    print(f"written: {config.output}/distributions.png and .json")
+
+
+if __name__ == "__main__":
+    run_recipe(main, Config)

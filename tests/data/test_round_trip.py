@@ -1,0 +1,135 @@
+"""What is recorded is what happened, and belongs together row by row, in every task."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from dynmap_rl.data import load_dataset, load_meta, record_dataset
+from dynmap_rl.data.demonstrations import Plan, plan_demonstrations, roll_out
+from dynmap_rl.envs.tasks import TASKS, get_task
+from dynmap_rl.envs.world import CONTROL_DT
+from dynmap_rl.experts import list_checkpoints
+from dynmap_rl.experts.policy import find_expert
+
+DYNAMICS = ("position", "velocity", "acceleration")
+TASK, CHECKPOINTS = get_task("bin_dropping"), list_checkpoints("bin_dropping")
+SMALL = {"episodes": 2, "eval_episodes": 1, "workers": 1}
+
+
+@pytest.fixture(scope="module")
+def dropping(tmp_path_factory):
+    """2 + 1 demonstrations of task 3."""
+    return record_dataset(tmp_path_factory.mktemp("datasets") / "dropping", "bin_dropping", **SMALL)
+
+
+@pytest.fixture(params=["recording", "dropping"])
+def dataset(request):
+    return request.getfixturevalue(request.param)
+
+
+def plan_of(row: dict) -> Plan:
+    pushes = tuple(tuple(span) for span in row["pushes"])
+    return Plan(row["scene_seed"], row["checkpoint"], row["noise"], row["detours"], pushes)
+
+
+def test_round_trip_is_exact(dataset):
+    episodes, meta = load_dataset(dataset), load_meta(dataset)
+    assert episodes.shape == (len(meta["episodes"]), 120)
+    for start in range(0, len(episodes), 2):
+        shard = slice(start, start + 2)
+        plans = [plan_of(row) for row in meta["episodes"][shard]]
+        truth = roll_out(meta["task"], plans, meta["expert"])
+        for key in ("pixels", "agent_pos", "goal", "action", *(("dynamics", k) for k in DYNAMICS)):
+            assert episodes[shard][key].dtype == truth[key].dtype
+            assert torch.equal(episodes[shard][key], truth[key]), key
+        for ours, theirs in (("reward", "reward"), ("done", "done"), ("success", "is_success")):
+            assert torch.equal(episodes[shard]["next", ours], truth["next", theirs])
+
+
+def test_replay_of_the_stored_actions_from_the_stored_scene(dataset):
+    episodes, meta = load_dataset(dataset), load_meta(dataset)
+    task = get_task(meta["task"])
+    for episode, row in zip(episodes, meta["episodes"], strict=True):
+        world = task.make_world(task.ranges.scene.from_dict(row["scene"]))
+        for step in episode:
+            for name in DYNAMICS:
+                np.testing.assert_array_equal(
+                    step["dynamics", name].numpy(), getattr(world, name).astype(np.float32)
+                )
+            world.step(step["action"].numpy())
+            assert step["next", "success"].item() == task.is_success(world)
+            assert step["next", "reward"].item() == np.float32(task.reward(world))
+        assert row["position_error"] == pytest.approx(world.position_error, abs=1e-6)
+
+
+def test_a_row_is_what_was_seen_before_its_action(dataset):
+    episodes = load_dataset(dataset).double()
+    position, velocity, acceleration = (episodes["dynamics", name] for name in DYNAMICS)
+    change = (velocity[:, 1:] - velocity[:, :-1]) / CONTROL_DT
+    torch.testing.assert_close(acceleration[:, 1:], change, atol=1e-4, rtol=0)
+    assert not acceleration[:, 0].any()
+    assert not velocity[:, 0].any()
+    moved = position[:, 1:, :3] - position[:, :-1, :3]
+    commanded = episodes["agent_pos"][..., :3]
+    torch.testing.assert_close(
+        commanded[:, 1:] - commanded[:, :-1], episodes["action"][:, :-1], atol=1e-6, rtol=0
+    )
+    # The cart moves by the mean of the last and the present commanded velocity: P_{t+1} follows a_t.
+    mean = (episodes["action"][:, :-1] + torch.cat([0 * moved[:, :1], episodes["action"][:, :-2]], 1)) / 2
+    torch.testing.assert_close(moved, mean, atol=2e-6, rtol=0)
+    off_by_one = (episodes["action"][:, 1:] + episodes["action"][:, :-1]) / 2
+    assert (moved - off_by_one).abs().max() > 1e-4
+
+
+def test_next_columns_come_after_the_action(dataset):
+    meta, after = load_meta(dataset), load_dataset(dataset)["next"]
+    assert after["done"][:, -1].all()
+    assert not after["done"][:, :-1].any()
+    assert after["success"][:, -1].all()
+    early = after["success"][:, 60:-1]
+    assert early.any() if meta["task"] == "bin_dropping" else not early.any()
+    assert not after["success"][:, 0].any()
+
+
+def test_recording_of_a_task_tells_what_it_is(dropping):
+    meta = load_meta(dropping)
+    assert (meta["task"], meta["expert"], meta["kind"]) == ("bin_dropping",) * 2 + ("demonstrations",)
+    assert meta["splits"] == {"train": [0, 2], "eval": [2, 3]}
+    assert all(row["success"] and row["checkpoint"] in CHECKPOINTS for row in meta["episodes"])
+    for row in meta["episodes"]:
+        scene = TASK.sample_scene(np.random.default_rng(row["scene_seed"]))
+        assert json.loads(json.dumps(scene.to_dict())) == row["scene"]
+    info = json.loads((dropping / "meta" / "info.json").read_text())
+    assert (info["total_episodes"], info["splits"]) == (3, {"train": "0:2", "eval": "2:3"})
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_pushes_come_when_the_task_says(task):
+    """A disturbed expert of task 3 is pushed while it still carries the block."""
+    plans = plan_demonstrations(task, "train", 0, 60)
+    first, end = get_task(task).push_steps
+    starts = [start for plan in plans for start, _ in plan.pushes]
+    assert len(starts) == 40 * 4
+    assert first <= min(starts) < first + 10 and end - 10 <= max(starts) < end
+    assert all(2 <= last - start <= 6 for plan in plans for start, last in plan.pushes)
+    assert {plan.checkpoint for plan in plans} == set(list_checkpoints(task))
+
+
+def test_expert_of_a_folder_is_recorded(tmp_path):
+    """One shipped checkpoint in another folder, by another name, acts as ever."""
+    expert, shipped = tmp_path / "checkpoint", CHECKPOINTS[-1]
+    expert.mkdir()
+    for suffix in ("json", "safetensors"):
+        shutil.copy(find_expert("bin_dropping") / f"{shipped}.{suffix}", expert / f"mine.{suffix}")
+    root = record_dataset(tmp_path / "d", "bin_dropping", **SMALL, expert=expert)
+    meta = load_meta(root)
+    assert meta["expert"] == str(expert)
+    assert {row["checkpoint"] for row in meta["episodes"]} == {"mine"}
+    plans = [plan_of({**row, "checkpoint": shipped}) for row in meta["episodes"][:2]]
+    assert torch.equal(load_dataset(root, "train")["action"], roll_out("bin_dropping", plans)["action"])
+    assert record_dataset(root, "bin_dropping", **SMALL, expert=str(expert)) == root
+    with pytest.raises(ValueError, match=f"expert: {expert} there, bin_dropping here"):
+        record_dataset(root, "bin_dropping", **SMALL)

@@ -1,0 +1,42 @@
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from dynmap_rl.runs import read_json
+
+ROOT = Path(__file__).parents[2]
+
+
+def run(folder, *arguments):
+    command = [sys.executable, str(ROOT / "recipes" / "evaluate.py"), *arguments]
+    return subprocess.run(command, cwd=folder, env=os.environ, capture_output=True, text=True)
+
+
+def test_task_1s_expert_meets_the_obstacle_of_task_2(tmp_path):
+    arguments = ["--task", "balance_reaching_obstacle", "--expert", "balance_reaching", "--episodes", "30"]
+    result = run(tmp_path, *arguments, "--split", "validation")
+    assert result.returncode == 0, result.stderr
+    rates = read_json(tmp_path / "runs/evaluate/balance_reaching_obstacle_balance_reaching.json")["rates"]
+    assert 20 < rates["straight_path_blocked"] < 80
+    assert rates["touched"] > 20
+    assert rates["success"] + rates["touched"] <= 100
+    assert f"{rates['touched']:5.1f} %" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--expert", "nobody"], "no expert at nobody"),
+        (["--checkpoint", "iteration_999"], "choose from"),
+        (["--episodes", "0"], "at least 1"),
+        (["--split", "holiday"], "unknown split"),
+    ],
+)
+def test_bad_input_gets_one_clear_line(tmp_path, arguments, message):
+    result = run(tmp_path, *arguments)
+    assert result.returncode == 2
+    assert message in result.stderr and "Traceback" not in result.stderr
+    assert not any(tmp_path.iterdir())

@@ -1,0 +1,117 @@
+"""A task of one's own, in a module of one's own, named as ``module:Class``."""
+
+import sys
+
+import numpy as np
+import pytest
+import torch
+from torchrl.envs.utils import check_env_specs
+
+from dynmap_rl.envs import DynmapBatchedEnv, DynmapEnv
+from dynmap_rl.envs.renderer import Renderer
+from dynmap_rl.envs.tasks import TASKS, get_task
+from dynmap_rl.envs.world import EPISODE_STEPS
+
+MODULE = '''
+"""Lift the block to the height of a green line."""
+
+import math
+
+from dynmap_rl.envs.scene import GOAL_COLOR
+from dynmap_rl.envs.tasks import BalanceReaching
+from dynmap_rl.envs.world import EPISODE_STEPS
+
+
+class Lift(BalanceReaching):
+    name = "lift"
+    description = "Lift the free-standing block to the green line."
+
+    def height(self, world):
+        return abs(world.position[4] - world.scene.goal_y)
+
+    def reward(self, world):
+        return math.exp(-8 * self.height(world)) - self.effort(world)
+
+    def is_success(self, world):
+        return world.steps >= EPISODE_STEPS and not world.dropped and bool(self.height(world) < 0.03)
+
+    def markers(self, scene):
+        low, high = scene.goal_y - 0.01, scene.goal_y + 0.01
+        return [([(0, low), (1, low), (1, high), (0, high)], GOAL_COLOR)]
+'''
+NAME = "my_tasks:Lift"
+START = {"cart_x": 0.5, "cart_y": 0.2, "cart_height": 0.04, "block_height": 0.16, "goal_y": 0.5}
+BLOCK_START = 0.3
+
+
+@pytest.fixture(autouse=True)
+def my_tasks(tmp_path, monkeypatch):
+    """The module, where Python finds it for the time of a test."""
+    (tmp_path / "my_tasks.py").write_text(MODULE)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield
+    sys.modules.pop("my_tasks", None)
+
+
+def lift(env: DynmapEnv, height: float) -> list[tuple]:
+    """The steps of an episode in which the cart goes up smoothly by a height."""
+    env.reset(seed=0, options=START)
+    path = height * (1 - np.cos(np.linspace(0, np.pi, EPISODE_STEPS - 19))) / 2
+    path = np.concatenate([path, np.full(20, height)])
+    return [env.step(np.array([0.0, dy, 0.0]))[1:] for dy in np.diff(path)]
+
+
+def test_own_task_needs_no_place_among_the_shipped_ones():
+    assert get_task(NAME).name == "lift"
+    assert "lift" not in TASKS and NAME not in TASKS
+
+
+@pytest.mark.parametrize("error, success", [(0.0, True), (0.025, True), (-0.025, True), (0.035, False)])
+def test_own_success_is_told_by_gymnasium(error, success):
+    env = DynmapEnv(NAME)
+    steps = lift(env, 0.5 - BLOCK_START + error)
+    assert len(steps) == EPISODE_STEPS
+    told = [bool(info["is_success"]) for *_, info in steps]
+    assert told == [False] * (EPISODE_STEPS - 1) + [success]
+    assert not any(terminated for _, terminated, *_ in steps)
+    assert steps[-1][0] == pytest.approx(np.exp(-8 * abs(error)), abs=0.01)
+
+
+def test_own_reward_grows_with_the_lift():
+    rewards = [reward for reward, *_ in lift(DynmapEnv(NAME), 0.2)]
+    assert rewards[0] < 0.3 < rewards[50] < 0.95 < rewards[-1]
+
+
+@pytest.mark.parametrize("arguments", [{}, {"num_envs": 2, "from_pixels": True, "control": "acceleration"}])
+def test_own_task_is_a_torchrl_environment(arguments):
+    check_env_specs(DynmapBatchedEnv(NAME, **arguments), seed=0)
+
+
+def test_both_adapters_take_it_alike():
+    env, batched = DynmapEnv(NAME, obs_type="pixels"), DynmapBatchedEnv(NAME, from_pixels=True)
+    td = batched.reset(batched.fake_tensordict().empty().set("scene_seed", torch.tensor([7])))
+    pixels, _ = env.reset(seed=7)
+    np.testing.assert_array_equal(td["pixels"][0].permute(1, 2, 0), pixels)
+    for _ in range(10):
+        action = np.array([0.002, 0.01, 0.001], dtype=np.float32)
+        pixels, reward, *_ = env.step(action)
+        td = batched.step(td.set("action", torch.from_numpy(action)[None]))["next"]
+        np.testing.assert_array_equal(td["pixels"][0].permute(1, 2, 0), pixels)
+        assert td["reward"].item() == np.float32(reward)
+
+
+def test_own_marker_is_drawn_as_a_line_across_the_picture():
+    task = get_task(NAME)
+    world = task.make_world(task.ranges.scene(cart_y=0.2, goal_y=0.75))
+    green = (Renderer().draw(world, task) == (0, 200, 0)).all(-1)
+    rows, columns = green.nonzero()
+    assert set(columns) == set(range(64))
+    np.testing.assert_allclose(1 - (rows.mean() + 0.5) / 64, 0.75, atol=1 / 64)
+    assert 1 <= len(set(rows)) <= 3
+
+
+@pytest.mark.parametrize("name", ["my_tasks:Nope", "my_taskz:Lift", "my_tasks:", ":Lift", "Lift"])
+@pytest.mark.parametrize("make", [get_task, DynmapEnv, DynmapBatchedEnv])
+def test_a_task_that_is_not_there_is_one_clear_error(make, name):
+    with pytest.raises(ValueError, match=f"(there is no|unknown) task '{name}'"):
+        make(name)
