@@ -95,7 +95,7 @@ def train_policy(
         policy: changed in place.
         features, held_out: what :func:`dynmap_rl.data.compute_features` gave.
         folder: gets ``metrics.jsonl``.
-        settings: with ``policy_updates``, ``policy_batch`` and ``policy_learning_rate``.
+        settings: with ``policy_updates``, ``policy_batch``, ``policy_learning_rate`` and ``emphasis``.
         seed: of the batches; also the progress bar's line.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -108,13 +108,14 @@ def train_policy(
         set_learning_rate(optimizer, settings.policy_learning_rate, update, settings.policy_updates)
         batch = features[torch.randint(len(features), (settings.policy_batch,), generator=generator)]
         predicted = policy(*(batch[k] for k in keys))
-        loss = imitation_loss(predicted, batch["action"], policy.action, batch.get("disturbed", None))
+        ignore = batch["disturbed"]
+        loss = imitation_loss(predicted, batch["action"], policy.action, ignore, settings.emphasis)
         step(loss, optimizer)
         done = update + 1
         if done % 100 == 0 or done == settings.policy_updates:
             with torch.no_grad():
                 predicted = policy(*(held_out[k] for k in keys))
-                ignore = held_out.get("disturbed", None)
+                ignore = held_out["disturbed"]
                 validation = imitation_loss(predicted, held_out["action"], policy.action, ignore)
             runs.append_metrics(folder, done, loss=loss, held_out_loss=validation)
             progress.set_postfix(loss=f"{loss:.4f}", held_out=f"{validation:.4f}")

@@ -29,12 +29,14 @@ class Config:
     # Run folder; by default runs/generalize/TASK/SUPERVISION_POLICY.
     run: Path | None = None
     # Policy: optimiser steps, episodes a step, augmented copies of every demonstration, peak learning rate.
-    policy_updates: int = 1500
+    policy_updates: int = 2500
     policy_batch: int = 32
     copies: int = 2
     # Pixels by which those copies are shifted at most.
     shift: int = 0
-    policy_learning_rate: float = 1e-3
+    policy_learning_rate: float = 3e-3
+    # Weight of the steps in which the expert changes its action (see imitation_loss); 0 for the paper's plain L1.
+    emphasis: float = 60.0
     # Evaluation: scenes of the paper's protocol, shared start states, and the split they are of: test, or validation
     # for choosing settings.
     split: str = "test"

@@ -27,6 +27,7 @@ SETTINGS = SimpleNamespace(
     policy_updates=4,
     policy_batch=2,
     policy_learning_rate=1e-3,
+    emphasis=30.0,
 )
 
 
@@ -98,11 +99,26 @@ def test_features_are_the_plain_episodes_first_then_the_copies():
     episodes = make_episodes()
     features = compute_features(model, episodes, 2, torch.Generator().manual_seed(0), max_shift=6)
     assert features.shape == (9, 12)
-    assert torch.equal(features["action"], episodes["action"].repeat(3, 1, 1)), "copies are never mirrored"
+    assert torch.equal(features["action"][:3], episodes["action"])
+    assert not features["disturbed"][:3].any()
     assert not torch.equal(features["goal"][3:6], episodes["goal"])
-    assert not torch.equal(features["latent"][3:6], features["latent"][:3])
     with torch.no_grad():
         torch.testing.assert_close(features["latent"][:3], model.encode(episodes["pixels"]))
+
+
+def test_a_copy_begins_anywhere_with_an_empty_memory_and_ends_where_the_episode_ends():
+    model = make_model().eval()
+    episodes = make_episodes()
+    features = compute_features(model, episodes, 6, torch.Generator().manual_seed(0))
+    starts = set()
+    for episode, copy in zip(episodes["action"].repeat(6, 1, 1), features[3:], strict=True):
+        [start] = (episode == copy["action"][0]).all(-1).nonzero().tolist()[0]
+        starts.add(start)
+        left = 12 - start
+        assert torch.equal(copy["action"][:left], episode[start:]), "copies are not mirrored"
+        assert copy["disturbed"][:, 0].tolist() == [False] * left + [True] * start
+        assert not copy["hidden1"][0].any()
+    assert len(starts) > 2 and max(starts) < 6
 
 
 def test_a_loss_that_is_not_finite_stops_the_run(tmp_path):

@@ -25,23 +25,42 @@ def compute_features(
     Args:
         world_model: frozen.
         episodes: ``[E, T]`` with ``pixels``, ``action``, ``goal``, ``dynamics``.
-        copies: so many augmented versions of every episode follow the plain ones.
+        copies: so many augmented versions of every episode follow the plain ones, each from a random step on.
         generator: of the augmentations.
         max_shift: pixels by which the copies are shifted; 0 where a place in the picture means something, such as
             that of an obstacle which is always there.
 
     Returns:
-        ``[(1 + copies) E, T]`` with ``latent``, ``hidden1``, ``hidden2``, ``action``, ``goal`` and, where the episodes
-        have it, ``disturbed``.
+        ``[(1 + copies) E, T]`` with ``latent``, ``hidden1``, ``hidden2``, ``action``, ``goal`` and ``disturbed``: the
+        steps that are no demonstration, by a push or beyond the end.
     """
+    if "disturbed" not in episodes:
+        episodes = episodes.copy().set("disturbed", torch.zeros(*episodes.shape, 1, dtype=torch.bool))
     parts = []
     for copy in range(copies + 1):
         for chunk in tqdm(episodes.split(batch), f"states {copy + 1}/{copies + 1}", leave=False):
             if copy:
+                chunk = _start_anywhere(chunk, generator)
                 chunk = augment(chunk, generator, max_shift, mirror=False)  # an expert may prefer one side
             latent = world_model.encode(chunk["pixels"])
             _, hidden1, hidden2 = world_model.predict(latent, chunk["action"])
             features = {"latent": latent, "hidden1": hidden1, "hidden2": hidden2}
-            kept = chunk.select("action", "goal", "disturbed", strict=False)
-            parts.append(TensorDict(features, chunk.shape).update(kept))
+            parts.append(
+                TensorDict(features, chunk.shape).update(chunk.select("action", "goal", "disturbed"))
+            )
     return torch.cat(parts)
+
+
+def _start_anywhere(episodes: TensorDictBase, generator: torch.Generator) -> TensorDictBase:
+    """Let each episode ``[E, T]`` begin at a random step of its first half, where memory is empty. What is then missing
+    at the end repeats the last step, and is marked as ``disturbed``, which imitation leaves out.
+
+    Memory tells the last action, and the next is nearly the same: a policy that only copies it has a low loss, but
+    stands still when control begins. So it must often decide by what it sees.
+    """
+    count, steps = episodes.shape
+    start = torch.randint(steps // 2, (count, 1), generator=generator)
+    index = start + torch.arange(steps)
+    episodes = episodes[torch.arange(count)[:, None], index.clamp(max=steps - 1)]
+    over = (index >= steps).unsqueeze(-1)
+    return episodes.set("disturbed", episodes["disturbed"] | over)

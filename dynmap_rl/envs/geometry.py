@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from .scene import BinScene, ObstacleScene, Point, SceneRanges
-from .world import WALL_RADIUS, Wall
+from .world import WALL_RADIUS, WORKSPACE_LOW, Wall
 
 Polygon = list[Point]
 
@@ -67,8 +67,9 @@ def keep_out(scene: ObstacleScene) -> tuple[Point, Point]:
     x, y = scene.obstacle_x, scene.obstacle_y
     half_width = max(scene.cart_width, *sizes.cart_width) / 2 + WALL_RADIUS + MARGIN
     half_height = scene.obstacle_length / 2 + max(scene.cart_height, *sizes.cart_height) / 2 + MARGIN
-    block_height = max(scene.block_height, *sizes.block_height)
-    return (x - half_width, y - half_height - block_height), (x + half_width, y + half_height)
+    low = y - half_height - max(scene.block_height, *sizes.block_height)
+    low = low if low > WORKSPACE_LOW[1] else -1.0  # no way under it
+    return (x - half_width, low), (x + half_width, y + half_height)
 
 
 def is_inside(point: Point, low: Point, high: Point) -> bool:

@@ -69,8 +69,8 @@ class ObstacleScene(Scene):
     """Task 2: a vertical obstacle, given by its middle and its length."""
 
     obstacle_x: float = 0.5
-    obstacle_y: float = 0.5
-    obstacle_length: float = 0.2
+    obstacle_y: float = 0.38
+    obstacle_length: float = 0.22
 
 
 @dataclass(frozen=True)
@@ -112,11 +112,11 @@ class SceneRanges:
 
 @dataclass(frozen=True)
 class ObstacleRanges(SceneRanges):
-    """Task 2: the obstacle stands in the centre of the picture."""
+    """Task 2: the obstacle stands in the centre of where cart and goal can be; the way under it is closed."""
 
     obstacle_x: Range = (0.5, 0.5)
-    obstacle_y: Range = (0.5, 0.5)
-    obstacle_length: Range = (0.2, 0.2)
+    obstacle_y: Range = (0.38, 0.38)
+    obstacle_length: Range = (0.22, 0.22)
 
     scene: ClassVar[type[Scene]] = ObstacleScene
 

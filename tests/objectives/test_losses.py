@@ -93,6 +93,25 @@ def test_imitation_loss_is_the_mean_absolute_error_in_normalised_units():
     assert imitation_loss(predicted, action, normalizer).item() == pytest.approx(0.5)
 
 
+def test_emphasis_weighs_the_steps_in_which_the_action_changes():
+    normalizer = Normalizer([-1.0], [1.0])
+    action = torch.tensor([[[0.0], [0.5], [0.5]]])
+    wrong_at = [torch.zeros(1, 3, 1).index_fill(1, torch.tensor([t]), 1.0) for t in range(3)]
+    losses = [imitation_loss(action + error, action, normalizer, emphasis=4.0).item() for error in wrong_at]
+    assert losses == pytest.approx([0.2, 0.6, 0.2])  # weights 1, 1 + 4 / 2, 1
+    moving_from_the_start = [
+        imitation_loss(action + e + 0.5, action + 0.5, normalizer, emphasis=4.0) for e in wrong_at
+    ]
+    assert moving_from_the_start[0] == moving_from_the_start[1] > moving_from_the_start[2]
+
+
+def test_ignored_steps_do_not_count_however_much_they_are_emphasised():
+    normalizer = Normalizer([-1.0], [1.0])
+    action, error = torch.tensor([[[0.5], [0.5]]]), torch.tensor([[[1.0], [0.0]]])
+    ignore = torch.tensor([[[True], [False]]])
+    assert imitation_loss(action + error, action, normalizer, ignore, emphasis=4.0) == 0
+
+
 def test_rms_has_a_gradient_at_zero():
     x = torch.zeros(3, requires_grad=True)
     rms(x).backward()
