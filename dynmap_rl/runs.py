@@ -180,6 +180,11 @@ def seed_everything(seed: int) -> None:
     torch.manual_seed(seed)
 
 
+def command_line() -> str:
+    """The command that started this process, as it would be given in the root of the repository."""
+    return " ".join(["python", f"recipes/{Path(sys.argv[0]).name}", *sys.argv[1:]])
+
+
 def start_worker() -> None:
     """End at once and without a word on Ctrl-C, and when the parent ends, even if it is killed."""
     from tqdm import tqdm

@@ -7,7 +7,6 @@ Prints success, drop and touch rates with 95 % Wilson intervals, for task 2 also
 goal is blocked, and writes them as JSON.
 """
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,7 +34,7 @@ def main(config: Config) -> None:
     from dynmap_rl.envs.tasks import TASKS, get_task
     from dynmap_rl.evaluation import scene_seeds, wilson
     from dynmap_rl.experts import load_expert, roll_out
-    from dynmap_rl.runs import write_json
+    from dynmap_rl.runs import command_line, write_json
 
     task = get_task(config.task)
     if config.episodes < 1:
@@ -67,7 +66,7 @@ def main(config: Config) -> None:
             "episodes": len(worlds),
             "rates": rates,
             "intervals": intervals,
-            "command": " ".join(["python", *sys.argv]),
+            "command": command_line(),
         },
     )
     print(f"written: {output}")

@@ -6,7 +6,6 @@
 Draws how the angles and angular velocities of tasks are distributed, side by side, and writes their ranges as JSON.
 """
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,15 +23,13 @@ class Config:
 def main(config: Config) -> None:
     from dynmap_rl.data import load_dataset, load_meta
     from dynmap_rl.evaluation.figures import plot_distributions
-    from dynmap_rl.runs import write_json
+    from dynmap_rl.runs import command_line, write_json
 
     names = [name.strip() for name in config.datasets.split(",")]
     dynamics = {load_meta(name)["task"]: load_dataset(name, "train")["dynamics"] for name in names}
     ranges = plot_distributions(dynamics, config.output / "distributions.png")
-    command = " ".join(["python", *sys.argv])
-    write_json(
-        config.output / "distributions.json", {"command": command, "datasets": names, "ranges": ranges}
-    )
+    facts = {"command": command_line(), "datasets": names, "ranges": ranges}
+    write_json(config.output / "distributions.json", facts)
     print(f"written: {config.output}/distributions.png and .json")
 
 

@@ -1,6 +1,10 @@
 """A task of one's own, in a module of one's own, named as ``module:Class``."""
 
+import os
+import re
+import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,33 +16,9 @@ from dynmap_rl.envs.renderer import Renderer
 from dynmap_rl.envs.tasks import TASKS, get_task
 from dynmap_rl.envs.world import EPISODE_STEPS
 
-MODULE = '''
-"""Lift the block to the height of a green line."""
-
-import math
-
-from dynmap_rl.envs.scene import GOAL_COLOR
-from dynmap_rl.envs.tasks import BalanceReaching
-from dynmap_rl.envs.world import EPISODE_STEPS
-
-
-class Lift(BalanceReaching):
-    name = "lift"
-    description = "Lift the free-standing block to the green line."
-
-    def height(self, world):
-        return abs(world.position[4] - world.scene.goal_y)
-
-    def reward(self, world):
-        return math.exp(-8 * self.height(world)) - self.effort(world)
-
-    def is_success(self, world):
-        return world.steps >= EPISODE_STEPS and not world.dropped and bool(self.height(world) < 0.03)
-
-    def markers(self, scene):
-        low, high = scene.goal_y - 0.01, scene.goal_y + 0.01
-        return [([(0, low), (1, low), (1, high), (0, high)], GOAL_COLOR)]
-'''
+RECIPES = Path(__file__).parents[1] / "recipes"
+README = (RECIPES.parent / "README.md").read_text()
+[MODULE] = [code for code in re.findall(r"```python\n(.*?)```", README, re.S) if "class Lift" in code]
 NAME = "my_tasks:Lift"
 START = {"cart_x": 0.5, "cart_y": 0.2, "cart_height": 0.04, "block_height": 0.16, "goal_y": 0.5}
 BLOCK_START = 0.3
@@ -115,3 +95,21 @@ def test_own_marker_is_drawn_as_a_line_across_the_picture():
 def test_a_task_that_is_not_there_is_one_clear_error(make, name):
     with pytest.raises(ValueError, match=f"(there is no|unknown) task '{name}'"):
         make(name)
+
+
+def test_the_recipes_take_it_from_the_expert_to_the_row(tmp_path):
+    """In the folder that holds the module, in workers too; an expert this short succeeds in nothing."""
+
+    def run(recipe, *arguments):
+        command = [sys.executable, str(RECIPES / f"{recipe}.py"), "--task", NAME, *arguments]
+        result = subprocess.run(command, cwd=tmp_path, env=os.environ, capture_output=True, text=True)
+        assert result.returncode == 0, result.stderr
+        return result.stdout
+
+    episodes = ["--eval_episodes", "2"]
+    run("expert", "--iterations", "1", "--num_envs", "4", "--epochs", "1", "--final_episodes", "2", *episodes)
+    expert = ["--expert", "runs/expert/lift/checkpoint"]
+    run("collect", *expert, "--kind", "exploration", "--episodes", "4", *episodes)
+    out = run("decoupled", "--smoke", "--dataset", "datasets/lift_exploration")
+    assert "RGB+[P+V], recurrent policy, my_tasks:Lift" in out
+    assert (tmp_path / "runs/decoupled/lift/position_velocity_recurrent_smoke/eval.json").exists()

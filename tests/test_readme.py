@@ -11,7 +11,11 @@ from dynmap_rl.evaluation.report import markdown_row, read_rows
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
-RESULTS = sorted((ROOT / "recipes" / "results").glob("decoupled_*.json"))
+RESULTS = [
+    p
+    for kind in ("decoupled", "generalize")
+    for p in sorted((ROOT / "recipes/results").glob(f"{kind}_*.json"))
+]
 
 
 def test_python_snippets_run(tmp_path, monkeypatch):
@@ -46,7 +50,32 @@ def test_every_option_and_file_that_the_readme_names_exists():
         assert (ROOT / path).exists(), path
     options = set(re.findall(r"--(\w+)", " ".join(re.findall(r"```bash\n(.*?)```", README, re.S))))
     known = "".join(
-        (ROOT / "recipes" / f"{name}.py").read_text() for name in ("decoupled", "collect", "expert")
+        (ROOT / "recipes" / f"{name}.py").read_text()
+        for name in ("decoupled", "generalize", "collect", "expert", "evaluate")
     )
     for option in options:
         assert re.search(rf"^    {option}: ", known, re.M), option
+
+
+def test_rates_of_the_experts_are_those_of_the_results():
+    def rates(name):
+        return json.loads((ROOT / f"recipes/results/expert_{name}.json").read_text())["rates"]
+
+    across = rates("balance_reaching_obstacle_balance_reaching")
+    text = " ".join(README.split())
+    assert f"blocks the straight path in {across['straight_path_blocked']:.1f} %" in text
+    assert f"task 1's expert fails in {100 - across['success']:.1f} %" in text
+    own = rates("balance_reaching_obstacle_balance_reaching_obstacle"), rates("bin_dropping_bin_dropping")
+    assert f"task 2's succeeds in {own[0]['success']:.1f} % and task 3's in {own[1]['success']:.1f} %" in text
+
+
+def test_ranges_of_the_dynamics_are_those_of_the_results():
+    ranges = json.loads((ROOT / "recipes/results/distributions.json").read_text())["ranges"]
+    one, three = ranges["balance_reaching"], ranges["bin_dropping"]
+    text = " ".join(README.split())
+    assert (
+        f"within {one['block angle'][2]:.2f} rad in task 1 and {three['block angle'][2]:.1f} rad in task 3"
+        in text
+    )
+    speeds = f"{one['block angular velocity'][2]:.1f} and {three['block angular velocity'][2]:.0f} rad/s"
+    assert speeds in text

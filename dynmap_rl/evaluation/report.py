@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 from pathlib import Path
 
 from tensordict import TensorDictBase
@@ -11,7 +10,7 @@ from tensordict import TensorDictBase
 from dynmap_rl.data import load_meta
 from dynmap_rl.envs import scene_seed
 from dynmap_rl.modules import Actor, WorldModel, load_policy
-from dynmap_rl.runs import read_json, write_json
+from dynmap_rl.runs import command_line, read_json, write_json
 
 from .paper import METRICS, paper_numbers, row_name
 from .rollout import episode_rows, roll_out, scene_seeds
@@ -85,7 +84,7 @@ def write_report(
         "settings": {
             k: str(v) if isinstance(v, Path) else v for k, v in dataclasses.asdict(settings).items()
         },
-        "command": " ".join(["python", *sys.argv]),
+        "command": command_line(),
         "results": results,
     }
     plot_reconstruction(world_model, episodes[:3], folder / "figures" / "reconstruction.png")

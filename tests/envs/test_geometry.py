@@ -18,8 +18,7 @@ TASK = get_task("balance_reaching_obstacle")
 ANYWHERE = ObstacleRanges(
     obstacle_x=(0.3, 0.7), obstacle_y=(0.3, 0.7), obstacle_length=(0.1, 0.3), min_distance=0.0
 )
-MARGIN = 0.03  # of start and goal
-WAY_MARGIN = 0.06
+MARGIN = 0.03
 
 
 def random_scenes(count: int) -> list[ObstacleScene]:
@@ -34,13 +33,16 @@ def draw(seed: int) -> dict:
     return {name: float(rng.uniform(*getattr(ANYWHERE, name))) for name in names}
 
 
-def forbidden(scene: ObstacleScene, x, y, margin: float = WAY_MARGIN):
-    """Whether a box around cart and block, as wide as the cart, is within ``margin`` of one around the obstacle."""
-    left, right = x - scene.cart_width / 2, x + scene.cart_width / 2
-    bottom, top = y - scene.cart_height / 2, y + scene.cart_height / 2 + scene.block_height
+def forbidden(scene: ObstacleScene, x, y, margin: float = MARGIN):
+    """Whether a box around the largest cart and block, as wide as the cart, is within ``margin`` of the obstacle, or
+    under one that leaves no room for it above the lowest place a cart can be at."""
+    width, tall = max(scene.cart_width, 0.3), max(scene.block_height, 0.2)
+    left, right = x - width / 2, x + width / 2
+    bottom, top = y - 0.02, y + 0.02 + tall
     beside = (right + margin <= scene.obstacle_x - 0.01) | (left - margin >= scene.obstacle_x + 0.01)
     half = scene.obstacle_length / 2
-    over = (bottom - margin >= scene.obstacle_y + half) | (top + margin <= scene.obstacle_y - half)
+    room = scene.obstacle_y - half - MARGIN - 0.02 - tall > 0.03
+    over = (bottom - margin >= scene.obstacle_y + half) | (room & (top + margin <= scene.obstacle_y - half))
     return np.logical_not(beside | over)
 
 
@@ -73,7 +75,9 @@ def test_hits_is_contact_in_the_world():
 
 
 def test_hits_begin_where_the_edges_meet():
-    scene = ObstacleScene(cart_width=0.24, cart_height=0.04, block_height=0.16, obstacle_length=0.2)
+    scene = ObstacleScene(
+        cart_width=0.24, cart_height=0.04, block_height=0.16, obstacle_y=0.5, obstacle_length=0.2
+    )
     places = {  # of the cart, which would just touch
         "left": (0.5 - 0.01 - 0.12, 0.5, (-1, 0)),
         "right": (0.5 + 0.01 + 0.12, 0.5, (1, 0)),
@@ -157,7 +161,7 @@ def test_way_is_the_shortest(seed):
     rng = np.random.default_rng(seed)
     scene = random_scenes(4)[seed]
     points = [tuple(p) for p in rng.integers(0, 101, (60, 2)) / 100]
-    start, *goals = [p for p in points if not forbidden(scene, *p, margin=WAY_MARGIN + 0.001)]
+    start, *goals = [p for p in points if not forbidden(scene, *p, margin=MARGIN + 0.001)]
     ours = np.array([length(way_around(scene, start, goal)) for goal in goals])
     grid = grid_lengths(scene, start, goals)
     detours = ours > [1.01 * math.dist(start, goal) for goal in goals]
@@ -175,7 +179,7 @@ def test_way_never_enters_and_is_straight_where_it_can_be():
         way = way_around(scene, start, goal)
         assert (way[0], way[-1]) == (start, goal)
         for leg in pairwise(way):
-            assert not forbidden(scene, *along(*leg), margin=WAY_MARGIN - 1e-6).any()
+            assert not forbidden(scene, *along(*leg), margin=MARGIN - 1e-6).any()
         if forbidden(scene, *along(start, goal, 1000)).any():
             around += 1
             assert len(way) > 2
@@ -200,7 +204,7 @@ def test_way_from_within_leads_straight_out_first():
         nearer = [forbidden(scene, *(start + step * np.array(d))) for d in ((1, 0), (-1, 0), (0, 1), (0, -1))]
         assert all(nearer), "another side is nearer"
         for leg in pairwise(way[1:]):
-            assert not forbidden(scene, *along(*leg), margin=WAY_MARGIN - 1e-6).any()
+            assert not forbidden(scene, *along(*leg), margin=MARGIN - 1e-6).any()
     assert seen > 15
 
 

@@ -14,7 +14,8 @@ from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.world import CONTROL_DT, EPISODE_STEPS, World
 
 TASK = get_task("balance_reaching_obstacle")
-ACROSS = ObstacleScene(cart_x=0.2, cart_y=0.5, goal_x=0.8, goal_y=0.5)  # the obstacle stands between
+BETWEEN = {"obstacle_x": 0.5, "obstacle_y": 0.5, "obstacle_length": 0.2}
+ACROSS = ObstacleScene(cart_x=0.2, cart_y=0.5, goal_x=0.8, goal_y=0.5, **BETWEEN)
 STILL = np.zeros(3)
 
 
@@ -145,7 +146,7 @@ def test_state_tells_obstacle_and_length_of_the_way():
 
 def test_obstacle_stands_in_the_centre_by_default_and_elsewhere_by_ranges():
     scene = TASK.sample_scene(np.random.default_rng(0))
-    assert (scene.obstacle_x, scene.obstacle_y, scene.obstacle_length) == (0.5, 0.5, 0.2)
+    assert (scene.obstacle_x, scene.obstacle_y, scene.obstacle_length) == (0.5, 0.38, 0.22)
     ranges = ObstacleRanges(obstacle_x=(0.3, 0.4), obstacle_length=(0.1, 0.15))
     for seed in range(20):
         scene = TASK.sample_scene(np.random.default_rng(seed), ranges)
