@@ -109,9 +109,7 @@ def train_policies(
     todo = [seed for seed in seeds if not (folder / f"seed_{seed}" / "eval.json").exists()]
     if todo:
         generator = torch.Generator().manual_seed(0)
-        features = data.compute_features(
-            world_model, episodes["train"], settings.copies, generator, settings.shift
-        )
+        features = data.compute_features(world_model, episodes["train"], settings.copies, generator)
         features.memmap(folder / "features" / "train")
         data.compute_features(world_model, episodes["eval"]).memmap(folder / "features" / "eval")
         _run_seeds([(settings, folder, constants, seed, frozen) for seed in todo])

@@ -202,7 +202,7 @@ def run_recipe(main, config_class) -> None:
     """
     import draccus
 
-    sys.path.insert(0, os.getcwd())  # where the module of a task named module:Class may lie
+    sys.path.append(os.getcwd())  # where the module of a task named module:Class may lie; it shadows nothing
     arguments = [a for a in sys.argv[1:] if a != "--debug"]
     debug = len(arguments) < len(sys.argv) - 1
     flags = {f"--{f.name}" for f in dataclasses.fields(config_class) if f.type in (bool, "bool")}

@@ -32,8 +32,6 @@ class Config:
     policy_updates: int = 2500
     policy_batch: int = 32
     copies: int = 2
-    # Pixels by which those copies are shifted at most.
-    shift: int = 0
     policy_learning_rate: float = 3e-3
     # Weight of the steps in which the expert changes its action (see imitation_loss); 0 for the paper's plain L1.
     emphasis: float = 60.0

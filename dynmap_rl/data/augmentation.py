@@ -32,8 +32,8 @@ def augment(
     """Mirror, shift and recolour windows ``[B, T]`` at random, each window in its own way.
 
     Each change is a symmetry of the scene: x -> 1 - x (and theta -> -theta), unless ``mirror`` is false; a shift by
-    up to ``max_shift`` whole pixels (the border is repeated); a permutation of the colour channels. Pixels, dynamics, action and goal follow;
-    ``agent_pos`` and ``state`` are left out.
+    up to ``max_shift`` whole pixels (the border is repeated); a permutation of the colour channels. Pixels,
+    dynamics, action and goal follow; ``agent_pos`` and ``state`` are left out.
     """
     batch = windows.shape[0]
     mirrored = (torch.rand(batch, generator=generator) < 0.5) & mirror

@@ -10,8 +10,8 @@ import torch
 from tensordict import TensorDict
 
 from dynmap_rl.envs import DynmapBatchedEnv, scene_seed
-from dynmap_rl.envs.tasks import get_task
-from dynmap_rl.envs.world import ACTION_LIMIT, EPISODE_STEPS
+from dynmap_rl.envs.tasks import BalanceReaching, get_task
+from dynmap_rl.envs.world import ACTION_LIMIT, EPISODE_STEPS, World
 from dynmap_rl.experts import list_checkpoints, load_expert
 
 KEYS = [
@@ -89,9 +89,8 @@ def roll_out(task: str, plans: list[Plan], expert: str | Path | None = None) -> 
     steps = []
     for t in range(EPISODE_STEPS):
         state = td["state"].clone()
-        goal = detours[:, t]  # [E, 2], NaN where the scene's own goal holds
-        apart = 2 * (goal - td["dynamics", "position"][:, :2])
-        state[:, :2] = torch.where(goal.isnan(), state[:, :2], apart)
+        for row in np.flatnonzero(~np.isnan(detours[:, t, 0])):
+            state[row] = torch.from_numpy(_state_for(env.task, env.worlds[row], detours[row, t]))
         acceleration = _expert_acceleration(state, plans, networks, rngs)
         action = np.stack([w.action_for(a) for w, a in zip(env.worlds, acceleration, strict=True)])
         _push(t, action, plans)
@@ -101,6 +100,14 @@ def roll_out(task: str, plans: list[Plan], expert: str | Path | None = None) -> 
         steps.append(td.select(*KEYS))
         td = td["next"]
     return torch.stack(steps, 1)
+
+
+def _state_for(task: BalanceReaching, world: World, goal: np.ndarray) -> np.ndarray:
+    """The state as if the goal were another."""
+    own, world.goal = world.goal, goal
+    state = task.state(world)
+    world.goal = own
+    return state
 
 
 def _expert_acceleration(state, plans, networks, rngs) -> np.ndarray:
@@ -129,13 +136,13 @@ def _draw_pushes(scene_seed: int, number: int) -> tuple[tuple[int, int], ...]:
     return tuple((int(t), int(t + rng.integers(2, 7))) for t in starts)
 
 
-def _detour_goals(plans: list[Plan], rngs) -> torch.Tensor:
+def _detour_goals(plans: list[Plan], rngs) -> np.ndarray:
     """``[E, 120, 2]`` goals of the detours (m), each for 20 to 40 steps from the start; NaN afterwards."""
-    goals = np.full((len(plans), EPISODE_STEPS, 2), np.nan, dtype=np.float32)
+    goals = np.full((len(plans), EPISODE_STEPS, 2), np.nan)
     for row, (plan, rng) in enumerate(zip(plans, rngs, strict=True)):
         t = 0
         for _ in range(plan.detours):
             end = t + int(rng.integers(20, 41))
             goals[row, t:end] = rng.uniform((0.15, 0.08), (0.85, 0.75))
             t = end
-    return torch.from_numpy(goals)
+    return goals

@@ -17,7 +17,6 @@ def compute_features(
     episodes: TensorDictBase,
     copies: int = 0,
     generator: torch.Generator | None = None,
-    max_shift: int = 0,
     batch: int = 10,
 ) -> TensorDict:
     """Latents and hidden states of whole episodes, with the actions and goals that go with them.
@@ -25,10 +24,8 @@ def compute_features(
     Args:
         world_model: frozen.
         episodes: ``[E, T]`` with ``pixels``, ``action``, ``goal``, ``dynamics``.
-        copies: so many augmented versions of every episode follow the plain ones, each from a random step on.
-        generator: of the augmentations.
-        max_shift: pixels by which the copies are shifted; 0 where a place in the picture means something, such as
-            that of an obstacle which is always there.
+        copies: so many recoloured versions of every episode follow the plain ones, each from a random step on.
+        generator: of the copies.
 
     Returns:
         ``[(1 + copies) E, T]`` with ``latent``, ``hidden1``, ``hidden2``, ``action``, ``goal`` and ``disturbed``: the
@@ -41,7 +38,8 @@ def compute_features(
         for chunk in tqdm(episodes.split(batch), f"states {copy + 1}/{copies + 1}", leave=False):
             if copy:
                 chunk = _start_anywhere(chunk, generator)
-                chunk = augment(chunk, generator, max_shift, mirror=False)  # an expert may prefer one side
+                # Neither shifted nor mirrored: an obstacle has its place, and an expert may prefer one side.
+                chunk = augment(chunk, generator, max_shift=0, mirror=False)
             latent = world_model.encode(chunk["pixels"])
             _, hidden1, hidden2 = world_model.predict(latent, chunk["action"])
             features = {"latent": latent, "hidden1": hidden1, "hidden2": hidden2}

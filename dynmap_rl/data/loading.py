@@ -64,7 +64,7 @@ def load_meta(dataset: str | Path) -> dict:
     """What is known of a recording beside its columns.
 
     Returns:
-        ``format``, ``task``, ``kind``, ``splits`` (name to first episode and the one after the last),
+        ``format``, ``task``, ``expert``, ``kind``, ``splits`` (name to first episode and the one after the last),
         ``normalization`` (see :func:`dynmap_rl.data.normalization_constants`), and ``episodes``, a dict for each:
         ``episode_index``, ``split``, ``scene_seed``, ``checkpoint``, ``noise``, ``detours``, ``pushes``, ``scene``,
         ``success``, ``dropped``, ``position_error`` (m).

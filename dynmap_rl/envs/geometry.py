@@ -11,6 +11,7 @@ from .world import WALL_RADIUS, WORKSPACE_LOW, Wall
 
 Polygon = list[Point]
 
+SIZES = SceneRanges()
 MARGIN = 0.03  # m, between the obstacle and the largest cart and block
 
 
@@ -63,11 +64,10 @@ def keep_out(scene: ObstacleScene) -> tuple[Point, Point]:
     """Two corners, lower left and upper right, of where the cart's centre must not be, so that the rectangle around
     the largest cart and block of the default ranges stays a margin away from the obstacle. The same for all sizes, so
     that the way around it can be learnt from where cart and goal are."""
-    sizes = SceneRanges()
     x, y = scene.obstacle_x, scene.obstacle_y
-    half_width = max(scene.cart_width, *sizes.cart_width) / 2 + WALL_RADIUS + MARGIN
-    half_height = scene.obstacle_length / 2 + max(scene.cart_height, *sizes.cart_height) / 2 + MARGIN
-    low = y - half_height - max(scene.block_height, *sizes.block_height)
+    half_width = max(scene.cart_width, *SIZES.cart_width) / 2 + WALL_RADIUS + MARGIN
+    half_height = scene.obstacle_length / 2 + max(scene.cart_height, *SIZES.cart_height) / 2 + MARGIN
+    low = y - half_height - max(scene.block_height, *SIZES.block_height)
     low = low if low > WORKSPACE_LOW[1] else -1.0  # no way under it
     return (x - half_width, low), (x + half_width, y + half_height)
 

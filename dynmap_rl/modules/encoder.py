@@ -57,7 +57,7 @@ class Encoder(nn.Module):
             features = torch.cat([self.squeeze(y).flatten(1), *points], -1)
         else:
             features = y.flatten(1)
-        return self.project(features) + 5 * self.color(color)  # (N, Z)
+        return self.project(features) + 5 * self.color(color)  # (N, Z); 5, for mean colours differ little
 
 
 class SpatialSoftmax(nn.Module):
