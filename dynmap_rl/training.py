@@ -59,7 +59,7 @@ def train_world_model(
         set_learning_rate(optimizer, settings.learning_rate, update, settings.updates)
         windows = sample_windows(train, settings.windows, settings.window_steps, generator)
         windows = add_distractors(augment(windows, generator), generator, settings.distractors)
-        with torch.autocast("cpu", torch.bfloat16):
+        with mixed_precision(windows.device):
             losses = loss_module(windows)
         step(sum(losses.values()), optimizer)
         done = update + 1
@@ -107,7 +107,8 @@ def train_policy(
     for update in progress:
         set_learning_rate(optimizer, settings.policy_learning_rate, update, settings.policy_updates)
         batch = features[torch.randint(len(features), (settings.policy_batch,), generator=generator)]
-        predicted = policy(*(batch[k] for k in keys))
+        with mixed_precision(batch.device):
+            predicted = policy(*(batch[k] for k in keys))
         ignore = batch["disturbed"]
         loss = imitation_loss(predicted, batch["action"], policy.action, ignore, settings.emphasis)
         step(loss, optimizer)
@@ -148,8 +149,17 @@ def fingerprint(module: nn.Module) -> str:
     return digest.hexdigest()
 
 
+def mixed_precision(device: torch.device | None) -> torch.autocast:
+    """bfloat16 where the processor computes with it: a recurrent policy's update takes a third of the time."""
+    kind = torch.device(device or "cpu").type
+    fast = kind != "cpu" or torch.ops.mkldnn._is_mkldnn_bf16_supported()
+    return torch.autocast(kind, torch.bfloat16, enabled=fast)
+
+
 def make_optimizer(module: nn.Module, learning_rate: float, weight_decay: float) -> torch.optim.Optimizer:
-    return torch.optim.AdamW(module.parameters(), learning_rate, betas=(0.9, 0.99), weight_decay=weight_decay)
+    return torch.optim.AdamW(
+        module.parameters(), learning_rate, betas=(0.9, 0.99), weight_decay=weight_decay, fused=True
+    )
 
 
 def set_learning_rate(optimizer, peak: float, update: int, updates: int) -> None:

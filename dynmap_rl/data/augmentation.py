@@ -59,35 +59,44 @@ def add_distractors(windows: TensorDictBase, generator: torch.Generator, most: i
     They lie behind all that is in the picture, and input and target get the same, so that a world model learns to
     tell objects that it does not know from cart and block. Windows must be drawn on one background colour.
     """
-    pixels = windows["pixels"].clone()
-    for window in pixels:
-        scene = _draw_bars(most, generator)
-        background = window[0].flatten(1).mode(1).values[:, None, None]
-        free = (window == background).all(1)  # (T, H, W)
-        window[:] = torch.where((free & scene).unsqueeze(1), _draw_color(generator), window)
-    return windows.clone(False).set("pixels", pixels)
+    pixels = windows["pixels"]
+    background = pixels[:, 0].flatten(2).mode(2).values[:, None, :, None, None]  # (B, 1, 3, 1, 1)
+    red, green, blue = (pixels == background).unbind(2)  # (B, T, 64, 64)
+    bars = _draw_bars(len(pixels), most, pixels.shape[-1], generator)
+    painted = (red & green & blue & bars[:, None]).unsqueeze(2)
+    colors = _draw_colors(len(pixels), generator)[:, None, :, None, None]
+    return windows.clone(False).set("pixels", torch.where(painted, colors, pixels))
 
 
-def _draw_bars(most: int, generator: torch.Generator, size: int = 64) -> torch.Tensor:
-    """A mask ``[size, size]`` of 0 to ``most`` upright or level bars, 1 to 4 pixels thick."""
-    mask = torch.zeros(size, size, dtype=torch.bool)
-    for _ in range(_integer(0, most + 1, generator)):
-        sides = [_integer(1, 5, generator), _integer(4, 25, generator)]
-        height, width = sides if _integer(0, 2, generator) else sides[::-1]
-        row, column = _integer(0, size, generator), _integer(0, size, generator)
-        mask[row : row + height, column : column + width] = True
-    return mask
+def _draw_bars(batch: int, most: int, size: int, generator: torch.Generator) -> torch.Tensor:
+    """Masks ``[B, size, size]`` of 0 to ``most`` upright or level bars each, 1 to 4 pixels thick."""
+    shape = batch, most
+    thick, long = _integers(1, 5, shape, generator), _integers(4, 25, shape, generator)
+    upright = _integers(0, 2, shape, generator).bool()
+    rows = _span(torch.where(upright, long, thick), size, generator)[..., None]
+    columns = _span(torch.where(upright, thick, long), size, generator)[..., None, :]
+    count = _integers(0, most + 1, (batch, 1), generator)
+    chosen = (torch.arange(most) < count)[..., None, None]
+    return (rows & columns & chosen).any(1)
 
 
-def _draw_color(generator: torch.Generator) -> torch.Tensor:
-    """Vivid, as markers are: one channel at 180 or more, one at 80 or less, ``[3, 1, 1]``."""
-    channels = _integer(180, 256, generator), _integer(0, 256, generator), _integer(0, 81, generator)
-    order = torch.randperm(3, generator=generator)
-    return torch.tensor(channels, dtype=torch.uint8)[order, None, None]
+def _span(lengths: torch.Tensor, size: int, generator: torch.Generator) -> torch.Tensor:
+    """Masks ``[..., size]`` of so many pixels from a random one on."""
+    start = _integers(0, size, lengths.shape, generator).unsqueeze(-1)
+    grid = torch.arange(size)
+    return (grid >= start) & (grid < start + lengths.unsqueeze(-1))
 
 
-def _integer(low: int, high: int, generator: torch.Generator) -> int:
-    return int(torch.randint(low, high, (), generator=generator))
+def _draw_colors(batch: int, generator: torch.Generator) -> torch.Tensor:
+    """Vivid, as markers are: one channel at 180 or more, one at 80 or less, uint8 ``[B, 3]``."""
+    shape = batch, 1
+    values = [_integers(low, high, shape, generator) for low, high in ((180, 256), (0, 256), (0, 81))]
+    order = torch.rand(batch, 3, generator=generator).argsort(1)
+    return torch.cat(values, 1).gather(1, order).to(torch.uint8)
+
+
+def _integers(low: int, high: int, shape, generator: torch.Generator) -> torch.Tensor:
+    return torch.randint(low, high, shape, generator=generator)
 
 
 def _transform_pixels(pixels, mirror, shift, channels) -> torch.Tensor:
@@ -97,8 +106,6 @@ def _transform_pixels(pixels, mirror, shift, channels) -> torch.Tensor:
     columns = (grid - shift[:, :1]).clamp(0, size - 1)  # (B, W)
     columns = torch.where(mirror[:, None], size - 1 - columns, columns)
     rows = (grid + shift[:, 1:]).clamp(0, size - 1)
-    out = torch.empty_like(pixels)
-    for i in range(len(pixels)):
-        index = channels[i][:, None, None], rows[i][:, None], columns[i]
-        out[i] = pixels[i][:, *index]
-    return out
+    source = (channels[:, :, None, None] * size + rows[:, None, :, None]) * size + columns[:, None, None, :]
+    index = source.flatten(1)[:, None].expand(-1, pixels.shape[1], -1)
+    return pixels.flatten(2).gather(2, index).view_as(pixels)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import nn
+from torch.nn import functional as F
 
 
 class ChannelNorm(nn.Module):
@@ -17,7 +18,11 @@ class ChannelNorm(nn.Module):
         self.norm = nn.LayerNorm(channels)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return self.norm(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+        x = x.permute(0, 2, 3, 1)
+        # Autocast would widen x to float32. The kernel sums in float32 in any case.
+        with torch.autocast(x.device.type, enabled=False):
+            weight, bias = self.norm.weight.to(x.dtype), self.norm.bias.to(x.dtype)
+            return F.layer_norm(x, x.shape[-1:], weight, bias).permute(0, 3, 1, 2)
 
 
 def down(inputs: int, outputs: int) -> nn.Sequential:
