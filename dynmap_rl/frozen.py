@@ -6,75 +6,32 @@ and the weights of the world model are shown to be the same before and after.
 
 from __future__ import annotations
 
-import multiprocessing
 import shutil
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 
 from dynmap_rl import data, modules, runs
-from dynmap_rl.envs.tasks import get_task
-from dynmap_rl.evaluation import SHARED_STARTS, evaluate
+from dynmap_rl.evaluation import evaluate
 from dynmap_rl.modules import WorldModel
 from dynmap_rl.training import fingerprint, train_policy
 
 
-def check_settings(settings) -> list[int]:
-    """Refuse what cannot run, before anything is written.
+def load_source(run: Path) -> tuple[WorldModel, dict[str, str]]:
+    """The world model of a finished run, and where it is from: ``task`` and ``training`` (decoupled or joint).
 
     Args:
-        settings: with ``task``, ``policy``, ``seeds``, ``dataset``, ``split``, ``policy_updates``,
-            ``test_episodes`` and ``paper_episodes``.
-
-    Returns:
-        The seeds of the policies.
-
-    Raises:
-        ValueError: a setting is wrong; the message says which.
-    """
-    get_task(settings.task)
-    modules.check_policy(settings.policy)
-    try:
-        seeds = [int(seed) for seed in settings.seeds.split(",")]
-    except ValueError as error:
-        raise ValueError(f"--seeds are whole numbers such as 0,1,2, not {settings.seeds!r}") from error
-    if len(set(seeds)) < len(seeds):
-        raise ValueError(f"--seeds {settings.seeds} has one twice")
-    if settings.split not in ("test", "validation"):
-        raise ValueError(f"--split is test or validation, not {settings.split!r}")
-    if settings.test_episodes > SHARED_STARTS:
-        raise ValueError(f"there are {SHARED_STARTS} shared start states, not {settings.test_episodes}")
-    if min(settings.policy_updates, settings.test_episodes, settings.paper_episodes) < 1:
-        raise ValueError("updates and episodes must be at least 1")
-    if settings.dataset and (task := data.load_meta(settings.dataset)["task"]) != settings.task:
-        raise ValueError(f"{settings.dataset} holds the task {task}, not {settings.task}")
-    return seeds
-
-
-def find_or_record(settings) -> str | Path:
-    """The dataset of the settings, or ``datasets/TASK``, recorded if it is not there (six episodes for a smoke run)."""
-    if settings.dataset:
-        return settings.dataset
-    folder = Path("datasets") / get_task(settings.task).name
-    if settings.smoke:
-        folder = folder.with_name(f"{folder.name}_smoke")
-        return data.record_dataset(folder, settings.task, episodes=4, eval_episodes=2, workers=1)
-    return data.record_dataset(folder, settings.task)
-
-
-def read_source(run: Path) -> dict[str, str]:
-    """Where a run folder's world model is from: ``task`` and ``training`` (decoupled or joint).
+        run: its folder, or the ``world_model`` in it.
 
     Raises:
         ValueError: the folder is no such run, or it is not done.
     """
-    if not (run / "eval.json").exists():
+    run = run.parent if run.name == "world_model" else run
+    source = runs.read_json(run / "eval.json").get("world_model") if (run / "eval.json").exists() else None
+    if source is None:
         raise ValueError(f"{run} holds no finished run; train a world model with recipes/decoupled.py first")
-    result = runs.read_json(run / "eval.json")
-    return result.get("world_model", {"task": result["task"], "training": "decoupled"})
+    return modules.load_world_model(run / "world_model"), source
 
 
 def train_policies(
@@ -112,23 +69,13 @@ def train_policies(
         features = data.compute_features(world_model, episodes["train"], settings.copies, generator)
         features.memmap(folder / "features" / "train")
         data.compute_features(world_model, episodes["eval"]).memmap(folder / "features" / "eval")
-        _run_seeds([(settings, folder, constants, seed, frozen) for seed in todo])
+        runs.run_processes(
+            _train_and_evaluate, [(settings, folder, constants, seed, frozen) for seed in todo]
+        )
         shutil.rmtree(folder / "features")
     if fingerprint(modules.load_world_model(folder / "world_model")) != frozen:
         raise ValueError(f"the frozen world model of {folder} has changed; delete the folder and run again")
     return frozen
-
-
-def _run_seeds(arguments: list[tuple]) -> None:
-    """Two at a time, each in a process of its own; one alone in this one."""
-    if len(arguments) == 1:
-        return _train_and_evaluate(arguments[0])
-    context = multiprocessing.get_context("spawn")
-    try:
-        with ProcessPoolExecutor(2, mp_context=context, initializer=runs.start_worker) as pool:
-            list(pool.map(_train_and_evaluate, arguments))
-    except BrokenProcessPool as error:
-        raise OSError("a policy's process died (of memory?); the same command goes on") from error
 
 
 def _train_and_evaluate(arguments: tuple) -> None:

@@ -16,6 +16,9 @@ import random
 import signal
 import sys
 import threading
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,7 +33,7 @@ def write_json(path: Path, value) -> None:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(json.dumps(value, indent=1) + "\n")
+    temporary.write_text(_dump(value) + "\n")
     temporary.replace(path)
 
 
@@ -185,6 +188,24 @@ def command_line() -> str:
     return " ".join(["python", f"recipes/{Path(sys.argv[0]).name}", *sys.argv[1:]])
 
 
+def run_processes(work: Callable[[tuple], None], arguments: list[tuple]) -> None:
+    """Two at a time, each in a process of its own; one alone in this one.
+
+    Raises:
+        OSError: a process died.
+    """
+    if len(arguments) <= 1:
+        for one in arguments:
+            work(one)
+        return
+    context = multiprocessing.get_context("spawn")
+    try:
+        with ProcessPoolExecutor(2, mp_context=context, initializer=start_worker) as pool:
+            list(pool.map(work, arguments))
+    except BrokenProcessPool as error:
+        raise OSError("a process died (of memory?); the same command goes on") from error
+
+
 def start_worker() -> None:
     """End at once and without a word on Ctrl-C, and when the parent ends, even if it is killed."""
     from tqdm import tqdm
@@ -221,6 +242,17 @@ def run_recipe(main, config_class) -> None:
             raise
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
+
+
+def _dump(value, indent: str = "") -> str:
+    """JSON with an entry a line, but lists of plain values in one."""
+    inner = indent + " "
+    if isinstance(value, dict) and value:
+        lines = [f"{inner}{json.dumps(str(k))}: {_dump(v, inner)}" for k, v in value.items()]
+        return "{\n" + ",\n".join(lines) + f"\n{indent}}}"
+    if isinstance(value, list | tuple) and any(isinstance(v, dict | list | tuple) for v in value):
+        return "[\n" + ",\n".join(inner + _dump(v, inner) for v in value) + f"\n{indent}]"
+    return json.dumps(value)
 
 
 def _plain(value):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -12,10 +13,10 @@ from torch import nn
 from tqdm import tqdm
 
 from dynmap_rl import runs
-from dynmap_rl.data import add_distractors, augment, sample_windows
-from dynmap_rl.envs.world import EPISODE_STEPS
+from dynmap_rl.data import add_distractors, augment, compute_features, sample_windows
+from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.modules import WorldModel
-from dynmap_rl.objectives import WorldModelLoss, imitation_loss
+from dynmap_rl.objectives import JointLoss, WorldModelLoss, imitation_loss
 
 STATES = ("latent", "hidden1", "hidden2")
 
@@ -39,26 +40,96 @@ def train_world_model(
     Raises:
         ValueError: a loss is not finite.
     """
-    world_model.to(memory_format=torch.channels_last)  # with bfloat16 six times faster on a CPU
-    loss_module = WorldModelLoss(
-        world_model, settings.beta_z, settings.beta_dynamics, rgb_steps=settings.rgb_steps
+
+    def held_out() -> dict[str, float]:
+        return prediction_errors(world_model, episodes["eval"])
+
+    loss_module = _make_loss(world_model, settings)
+    _fit(
+        world_model,
+        loss_module,
+        episodes["train"],
+        held_out,
+        folder,
+        settings,
+        settings.world_model_seed,
+        save_every,
     )
-    optimizer = make_optimizer(world_model, settings.learning_rate, weight_decay=1e-4)
-    generator = torch.Generator().manual_seed(settings.world_model_seed)
-    train = episodes["train"].select("pixels", "action", "goal", "dynamics")
+
+
+def train_jointly(
+    world_model: WorldModel,
+    policy: nn.Module,
+    episodes: dict[str, TensorDictBase],
+    folder: Path,
+    settings,
+    seed: int,
+    end_to_end: bool = False,
+    save_every: int = 250,
+) -> None:
+    """Minimise Eq. 4 with the terms of Eq. 5, or, end to end, Eq. 3, in the manner of :func:`train_world_model`.
+
+    Windows are mirrored and shifted only where the task is ``symmetric``: the policy learns from them too.
+
+    Args:
+        world_model, policy: changed in place.
+        settings: also with ``task``, ``beta_joint`` and ``emphasis``; end to end without those of the world model's
+            losses.
+        seed: of the windows.
+        end_to_end: the policy's loss alone.
+    """
+    model = nn.ModuleDict({"world_model": world_model, "policy": policy})
+    if end_to_end:
+        loss_module = JointLoss(WorldModelLoss(world_model), policy, 1.0, settings.emphasis, end_to_end=True)
+    else:
+        loss_module = JointLoss(
+            _make_loss(world_model, settings), policy, settings.beta_joint, settings.emphasis
+        )
+
+    def held_out() -> dict[str, float]:
+        errors = {} if end_to_end else prediction_errors(world_model, episodes["eval"])
+        return errors | {"held_out_loss": policy_error(world_model, policy, episodes["eval"])}
+
+    symmetric = get_task(settings.task).symmetric
+    limits = {} if symmetric else {"max_shift": 0, "mirror": False}
+    _fit(model, loss_module, episodes["train"], held_out, folder, settings, seed, save_every, limits)
+
+
+def _make_loss(world_model: WorldModel, settings) -> WorldModelLoss:
+    return WorldModelLoss(world_model, settings.beta_z, settings.beta_dynamics, rgb_steps=settings.rgb_steps)
+
+
+def _fit(
+    model: nn.Module,
+    loss_module: nn.Module,
+    episodes: TensorDictBase,
+    held_out: Callable[[], dict[str, float]],
+    folder: Path,
+    settings,
+    seed: int,
+    save_every: int,
+    limits: dict | None = None,
+) -> None:
+    """The loop over windows; ``limits`` are those of the augmentation."""
+    model.to(memory_format=torch.channels_last)  # with bfloat16 six times faster on a CPU
+    optimizer = make_optimizer(model, settings.learning_rate, weight_decay=1e-4)
+    generator = torch.Generator().manual_seed(seed)
+    episodes = episodes.select("pixels", "action", "goal", "dynamics", "disturbed", strict=False)
 
     start, path = 0, folder / "checkpoint" / "world_model.pt"
     if state := runs.load_training_state(path):
-        world_model.load_state_dict(state["model"])
+        model.load_state_dict(state["model"])
         optimizer.load_state_dict(state["optimizer"])
         generator.set_state(state["generator"])
         start = state["update"]
     runs.truncate_metrics(folder, start)
-    progress = tqdm(range(start, settings.updates), "world model", settings.updates, initial=start)
+    progress = tqdm(range(start, settings.updates), folder.name, settings.updates, initial=start)
     for update in progress:
         set_learning_rate(optimizer, settings.learning_rate, update, settings.updates)
-        windows = sample_windows(train, settings.windows, settings.window_steps, generator)
-        windows = add_distractors(augment(windows, generator), generator, settings.distractors)
+        windows = sample_windows(episodes, settings.windows, settings.window_steps, generator)
+        windows = add_distractors(
+            augment(windows, generator, **limits or {}), generator, settings.distractors
+        )
         with mixed_precision(windows.device):
             losses = loss_module(windows)
         step(sum(losses.values()), optimizer)
@@ -67,23 +138,14 @@ def train_world_model(
             losses = {name: value.item() for name, value in losses.items()}
             progress.set_postfix({k.removeprefix("loss_"): f"{v:.3f}" for k, v in losses.items()})
         if done % save_every == 0 or done == settings.updates:
-            errors = prediction_errors(world_model, episodes["eval"])
-            runs.append_metrics(folder, done, **losses, **errors)
+            runs.append_metrics(folder, done, **losses, **held_out())
             runs.save_training_state(
                 path,
-                model=world_model.state_dict(),
+                model=model.state_dict(),
                 optimizer=optimizer.state_dict(),
                 generator=generator.get_state(),
                 update=done,
             )
-
-
-def check_training(settings) -> None:
-    """Raises ``ValueError`` for settings of a world model's training that cannot run."""
-    if not 2 <= settings.window_steps <= EPISODE_STEPS:
-        raise ValueError(f"--window_steps must be 2 to {EPISODE_STEPS}, not {settings.window_steps}")
-    if settings.updates < 1:
-        raise ValueError(f"--updates must be at least 1, not {settings.updates}")
 
 
 def train_policy(
@@ -125,7 +187,7 @@ def train_policy(
 @torch.no_grad()
 def prediction_errors(world_model: WorldModel, episodes: TensorDictBase, batch: int = 10) -> dict[str, float]:
     """One-step prediction errors on episodes ``[E, T]``: the frames' root mean square (0..1), and the mean absolute
-    error of each decoded quantity's x and y (m, m/s, m/s^2)."""
+    error of each decoded quantity's x and y (m, m/s, m/s^2) and of its angles (``_angle``: rad, rad/s, rad/s^2)."""
     sums: dict[str, float] = {}
     for chunk in episodes.split(batch):
         states = world_model.predict(world_model.encode(chunk["pixels"]), chunk["action"])
@@ -135,9 +197,18 @@ def prediction_errors(world_model: WorldModel, episodes: TensorDictBase, batch: 
         for name, value in world_model.decode_dynamics(*states).items():
             difference = (value - chunk["dynamics", name])[:, 1:].abs()
             errors[name] = difference[..., [0, 1, 3, 4]].mean()
+            errors[f"{name}_angle"] = difference[..., [2, 5]].mean()
         for name, value in errors.items():
             sums[f"error_{name}"] = sums.get(f"error_{name}", 0.0) + value.item() * len(chunk) / len(episodes)
     return sums
+
+
+@torch.no_grad()
+def policy_error(world_model: WorldModel, policy: nn.Module, episodes: TensorDictBase) -> float:
+    """The plain L1 loss of a policy on episodes ``[E, T]``."""
+    states = compute_features(world_model, episodes)
+    predicted = policy(*(states[k] for k in (*STATES, "goal")))
+    return imitation_loss(predicted, states["action"], policy.action, states["disturbed"]).item()
 
 
 def fingerprint(module: nn.Module) -> str:
@@ -152,7 +223,9 @@ def fingerprint(module: nn.Module) -> str:
 def mixed_precision(device: torch.device | None) -> torch.autocast:
     """bfloat16 where the processor computes with it: a recurrent policy's update takes a third of the time."""
     kind = torch.device(device or "cpu").type
-    fast = kind != "cpu" or torch.ops.mkldnn._is_mkldnn_bf16_supported()
+    fast = kind != "cpu" or (
+        torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported()
+    )
     return torch.autocast(kind, torch.bfloat16, enabled=fast)
 
 

@@ -29,7 +29,7 @@ class Config:
     dataset: str | None = None
     # Run folder; by default runs/decoupled/TASK/SUPERVISION_POLICY.
     run: Path | None = None
-    # A world model that is trained already (a folder of another run); by default one is trained here.
+    # Run folder whose world model is taken, of the same task and supervision; by default one is trained here.
     world_model: Path | None = None
     # World model: optimiser steps, windows a step, steps a window, decoded frames a window, peak learning rate.
     updates: int = 2500
@@ -69,19 +69,23 @@ SMOKE = {
 def main(config: Config) -> None:
     import torch
 
-    from dynmap_rl import data, frozen, modules, runs
+    from dynmap_rl import data, frozen, modules, runs, settings
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.evaluation import parse_supervision, print_row, write_report
-    from dynmap_rl.training import check_training, train_world_model
+    from dynmap_rl.training import train_world_model
 
     if config.smoke:
         runs.replace_defaults(config, SMOKE)
     supervision = parse_supervision(config.supervision)
-    seeds = frozen.check_settings(config)
-    check_training(config)
-    trained = modules.load_world_model(config.world_model) if config.world_model else None
-    if trained is not None and trained.supervision != supervision:
-        raise ValueError(f"{config.world_model} is supervised on {trained.supervision}, not on {supervision}")
+    seeds = settings.check_settings(config)
+    trained = None
+    if config.world_model:
+        trained, source = frozen.load_source(config.world_model)
+        if source != {"task": config.task, "training": "decoupled"} or trained.supervision != supervision:
+            raise ValueError(
+                f"{config.world_model} is a world model of {source['task']}, {source['training']}, supervised on "
+                f"{trained.supervision}; for another task use recipes/generalize.py"
+            )
     name = f"{'_'.join(supervision) or 'none'}_{config.policy}{'_smoke' if config.smoke else ''}"
     folder = config.run or Path("runs/decoupled") / get_task(config.task).name / name
     folder = runs.open_run(folder, config, ignore=("run", "threads"))
@@ -90,7 +94,7 @@ def main(config: Config) -> None:
         return print_row(runs.read_json(folder / "eval.json"))
     torch.set_num_threads(config.threads)
 
-    dataset = frozen.find_or_record(config)
+    dataset = settings.find_or_record(config)
     constants = data.load_meta(dataset)["normalization"]
     episodes = {split: data.load_dataset(dataset, split) for split in ("train", "eval")}
 

@@ -26,7 +26,12 @@ def main(config: Config) -> None:
     from dynmap_rl.runs import command_line, write_json
 
     names = [name.strip() for name in config.datasets.split(",")]
-    dynamics = {load_meta(name)["task"]: load_dataset(name, "train")["dynamics"] for name in names}
+    tasks = [load_meta(name)["task"] for name in names]
+    if len(set(tasks)) < len(tasks):
+        raise ValueError(f"--datasets are of the tasks {', '.join(tasks)}; name one of each")
+    dynamics = {
+        task: load_dataset(name, "train")["dynamics"] for task, name in zip(tasks, names, strict=True)
+    }
     ranges = plot_distributions(dynamics, config.output / "distributions.png")
     facts = {"command": command_line(), "datasets": names, "ranges": ranges}
     write_json(config.output / "distributions.json", facts)

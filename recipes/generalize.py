@@ -26,7 +26,7 @@ class Config:
     seeds: str = "0,1,2"
     # Dataset: a folder or a hub id; by default datasets/TASK, recorded if it is not there.
     dataset: str | None = None
-    # Run folder; by default runs/generalize/TASK/SUPERVISION_POLICY.
+    # Run folder; by default runs/generalize/TASK/TRAINING_SUPERVISION_POLICY.
     run: Path | None = None
     # Policy: optimiser steps, episodes a step, augmented copies of every demonstration, peak learning rate.
     policy_updates: int = 2500
@@ -53,26 +53,32 @@ SMOKE = {
 def main(config: Config) -> None:
     import torch
 
-    from dynmap_rl import data, frozen, modules, runs
+    from dynmap_rl import data, frozen, runs, settings
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.evaluation import print_row, write_report
+    from dynmap_rl.training import fingerprint
 
     if config.smoke:
         runs.replace_defaults(config, SMOKE)
-    seeds = frozen.check_settings(config)
-    source = frozen.read_source(config.world_model)
+    seeds = settings.check_settings(config)
+    world_model, source = frozen.load_source(config.world_model)
     if source["task"] == config.task:
         raise ValueError(f"{config.world_model} was trained on {config.task} itself; choose another --task")
-    world_model = modules.load_world_model(config.world_model / "world_model")
-    name = f"{'_'.join(world_model.supervision) or 'none'}_{config.policy}{'_smoke' if config.smoke else ''}"
+    name = f"{source['training']}_{'_'.join(world_model.supervision) or 'none'}_{config.policy}"
+    name += "_smoke" if config.smoke else ""
     folder = config.run or Path("runs/generalize") / get_task(config.task).name / name
     folder = runs.open_run(folder, config, ignore=("run", "threads"))
     if (folder / "eval.json").exists():
+        result = runs.read_json(folder / "eval.json")
+        if result["world_model_sha256"] != fingerprint(world_model):
+            raise ValueError(
+                f"{folder} was made with another world model; choose another --run, or delete it"
+            )
         print(f"{folder} is done; delete it to run again")
-        return print_row(runs.read_json(folder / "eval.json"))
+        return print_row(result)
     torch.set_num_threads(config.threads)
 
-    dataset = frozen.find_or_record(config)
+    dataset = settings.find_or_record(config)
     constants = data.load_meta(dataset)["normalization"]
     episodes = {split: data.load_dataset(dataset, split) for split in ("train", "eval")}
     fingerprint = frozen.train_policies(world_model, episodes, constants, folder, config, seeds)

@@ -1,9 +1,12 @@
-"""No network, no display, one thread; and one small recording that the tests of the data share."""
+"""No network, no display, one thread; and one small recording a task that the tests share."""
 
+import functools
 import os
+from pathlib import Path
 
 os.environ["HF_HUB_OFFLINE"] = "1"
 os.environ["SDL_VIDEODRIVER"] = "dummy"
+os.environ["OMP_NUM_THREADS"] = "1"  # of recipes that a test starts
 
 import pytest
 import torch
@@ -16,11 +19,22 @@ def pytest_configure(config):
 
 
 @pytest.fixture(scope="session")
-def recording(tmp_path_factory):
-    """A dataset of 4 + 2 demonstrations, in three shards; not to be written to."""
+def recordings(tmp_path_factory):
+    """The folder of a small dataset of a task, 4 + 2 demonstrations in three shards; not to be written to."""
     from dynmap_rl.data import record_dataset, recording
 
-    root = tmp_path_factory.mktemp("datasets") / "recording"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(recording, "SHARD_EPISODES", 2)
-        return record_dataset(root, episodes=4, eval_episodes=2, workers=1)
+    root = tmp_path_factory.mktemp("datasets")
+
+    @functools.cache
+    def record(task: str) -> Path:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(recording, "SHARD_EPISODES", 2)
+            return record_dataset(root / task / "recording", task, episodes=4, eval_episodes=2, workers=1)
+
+    return record
+
+
+@pytest.fixture(scope="session")
+def recording(recordings):
+    """That of task 1."""
+    return recordings("balance_reaching")

@@ -11,6 +11,7 @@ import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
 
+from dynmap_rl.data import load_dataset, load_meta
 from dynmap_rl.envs import DynmapBatchedEnv, DynmapEnv
 from dynmap_rl.envs.renderer import Renderer
 from dynmap_rl.envs.tasks import TASKS, get_task
@@ -19,15 +20,22 @@ from dynmap_rl.envs.world import EPISODE_STEPS
 RECIPES = Path(__file__).parents[1] / "recipes"
 README = (RECIPES.parent / "README.md").read_text()
 [MODULE] = [code for code in re.findall(r"```python\n(.*?)```", README, re.S) if "class Lift" in code]
-NAME = "my_tasks:Lift"
-START = {"cart_x": 0.5, "cart_y": 0.2, "cart_height": 0.04, "block_height": 0.16, "goal_y": 0.5}
+OWN_GOAL = """
+
+class Above(Lift):
+    def goal(self, world):
+        return world.scene.cart_x, world.scene.goal_y
+"""
+NAME, ABOVE = "my_tasks:Lift", "my_tasks:Above"
+START = {"cart_x": 0.5, "cart_y": 0.2, "cart_height": 0.04, "block_height": 0.16}
+START |= {"goal_y": 0.5, "ceiling": 0.84}
 BLOCK_START = 0.3
 
 
 @pytest.fixture(autouse=True)
 def my_tasks(tmp_path, monkeypatch):
     """The module, where Python finds it for the time of a test."""
-    (tmp_path / "my_tasks.py").write_text(MODULE)
+    (tmp_path / "my_tasks.py").write_text(MODULE + OWN_GOAL)
     monkeypatch.syspath_prepend(tmp_path)
     yield
     sys.modules.pop("my_tasks", None)
@@ -39,6 +47,10 @@ def lift(env: DynmapEnv, height: float) -> list[tuple]:
     path = height * (1 - np.cos(np.linspace(0, np.pi, EPISODE_STEPS - 19))) / 2
     path = np.concatenate([path, np.full(20, height)])
     return [env.step(np.array([0.0, dy, 0.0]))[1:] for dy in np.diff(path)]
+
+
+def test_example_is_short():
+    assert MODULE.count("\n") <= 40
 
 
 def test_own_task_needs_no_place_among_the_shipped_ones():
@@ -62,6 +74,30 @@ def test_own_reward_grows_with_the_lift():
     assert rewards[0] < 0.3 < rewards[50] < 0.95 < rewards[-1]
 
 
+def test_own_factor_is_drawn_can_be_fixed_and_is_seen_by_experts():
+    env, task = DynmapEnv(NAME), get_task(NAME)
+    ceilings = {task.sample_scene(np.random.default_rng(seed)).ceiling for seed in range(20)}
+    assert len(ceilings) == 20 and all(0.84 <= ceiling <= 0.94 for ceiling in ceilings)
+    state, _ = env.reset(seed=0, options={"ceiling": 0.84})
+    assert state in env.observation_space and state.shape == (17,)
+    assert state[-1] == pytest.approx(-1)
+
+
+@pytest.mark.parametrize("height, touched", [(0.44, False), (0.46, True)])
+def test_own_wall_is_in_the_way(height, touched):
+    """The top of the block starts 450 mm below it."""
+    assert any(info["touched"] for *_, info in lift(DynmapEnv(NAME), height)) is touched
+
+
+def test_own_goal_is_what_policies_are_given():
+    env, batched = DynmapEnv(ABOVE, obs_type="pixels_agent_pos"), DynmapBatchedEnv(ABOVE)
+    observation, _ = env.reset(seed=3)
+    td = batched.reset(batched.fake_tensordict().empty().set("scene_seed", torch.tensor([3])))
+    goal = np.float32([env.world.scene.cart_x, env.world.scene.goal_y])
+    for given in (observation["agent_pos"][3:], td["agent_pos"][0, 3:], td["goal"][0]):
+        np.testing.assert_array_equal(given, goal)
+
+
 @pytest.mark.parametrize("arguments", [{}, {"num_envs": 2, "from_pixels": True, "control": "acceleration"}])
 def test_own_task_is_a_torchrl_environment(arguments):
     check_env_specs(DynmapBatchedEnv(NAME, **arguments), seed=0)
@@ -80,14 +116,16 @@ def test_both_adapters_take_it_alike():
         assert td["reward"].item() == np.float32(reward)
 
 
-def test_own_marker_is_drawn_as_a_line_across_the_picture():
+def test_own_markers_are_drawn_as_lines_across_the_picture():
     task = get_task(NAME)
-    world = task.make_world(task.ranges.scene(cart_y=0.2, goal_y=0.75))
-    green = (Renderer().draw(world, task) == (0, 200, 0)).all(-1)
-    rows, columns = green.nonzero()
-    assert set(columns) == set(range(64))
-    np.testing.assert_allclose(1 - (rows.mean() + 0.5) / 64, 0.75, atol=1 / 64)
-    assert 1 <= len(set(rows)) <= 3
+    world = task.make_world(task.ranges.scene(cart_y=0.2, goal_y=0.6, ceiling=0.9))
+    rows, columns = (Renderer().draw(world, task) == (0, 200, 0)).all(-1).nonzero()
+    heights = 1 - (rows + 0.5) / 64
+    assert (np.minimum(abs(heights - 0.6), abs(heights - 0.9)) < 0.03).all()
+    for line in (0.6, 0.9):
+        near = abs(heights - line) < 0.03
+        assert set(columns[near]) == set(range(64))
+        assert heights[near].mean() == pytest.approx(line, abs=1 / 64)
 
 
 @pytest.mark.parametrize("name", ["my_tasks:Nope", "my_taskz:Lift", "my_tasks:", ":Lift", "Lift"])
@@ -101,7 +139,7 @@ def test_the_recipes_take_it_from_the_expert_to_the_row(tmp_path):
     """In the folder that holds the module, in workers too; an expert this short succeeds in nothing."""
 
     def run(recipe, *arguments):
-        command = [sys.executable, str(RECIPES / f"{recipe}.py"), "--task", NAME, *arguments]
+        command = [sys.executable, str(RECIPES / f"{recipe}.py"), "--task", ABOVE, *arguments]
         result = subprocess.run(command, cwd=tmp_path, env=os.environ, capture_output=True, text=True)
         assert result.returncode == 0, result.stderr
         return result.stdout
@@ -109,7 +147,14 @@ def test_the_recipes_take_it_from_the_expert_to_the_row(tmp_path):
     episodes = ["--eval_episodes", "2"]
     run("expert", "--iterations", "1", "--num_envs", "4", "--epochs", "1", "--final_episodes", "2", *episodes)
     expert = ["--expert", "runs/expert/lift/checkpoint"]
+    run("evaluate", *expert, "--episodes", "2")
+    assert (tmp_path / "runs/evaluate/lift_lift_iteration_001_test.json").exists()
     run("collect", *expert, "--kind", "exploration", "--episodes", "4", *episodes)
+    dataset = tmp_path / "datasets/lift_exploration"
+    scenes = [row["scene"] for row in load_meta(dataset)["episodes"]]
+    assert len({scene["ceiling"] for scene in scenes}) == 6
+    goals = torch.tensor([[scene["cart_x"], scene["goal_y"]] for scene in scenes])
+    assert torch.equal(load_dataset(dataset)["goal"], goals[:, None].expand(6, EPISODE_STEPS, 2))
     out = run("decoupled", "--smoke", "--dataset", "datasets/lift_exploration")
-    assert "RGB+[P+V], recurrent policy, my_tasks:Lift" in out
+    assert "RGB+[P+V], recurrent policy, my_tasks:Above" in out
     assert (tmp_path / "runs/decoupled/lift/position_velocity_recurrent_smoke/eval.json").exists()

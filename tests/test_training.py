@@ -2,12 +2,13 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 from tensordict import TensorDict
 
-from dynmap_rl import runs
+from dynmap_rl import frozen, runs
 from dynmap_rl.data import compute_features
 from dynmap_rl.modules import DYNAMICS, make_policy, make_world_model
-from dynmap_rl.training import fingerprint, train_policy, train_world_model
+from dynmap_rl.training import fingerprint, mixed_precision, train_policy, train_world_model
 
 CONSTANTS = {
     "action": {"low": [-0.02, -0.02, -0.05], "high": [0.02, 0.02, 0.05]},
@@ -94,14 +95,44 @@ def test_training_a_policy_leaves_the_world_model_as_it_was(tmp_path):
     assert fingerprint(model) != before
 
 
+@pytest.mark.parametrize(("seed", "message"), [(0, "this run is not valid"), (1, "delete the folder")])
+def test_a_frozen_world_model_that_changes_stops_the_run(tmp_path, monkeypatch, seed, message):
+    """One weight, on the disk, after the policy of a seed is finished: the first, or the last."""
+    weights = tmp_path / "world_model/weights.safetensors"
+
+    def work_and_tamper(work, arguments):
+        for number, one in enumerate(arguments):
+            work(one)
+            if number == seed:
+                state = load_file(weights)
+                next(iter(state.values())).view(-1)[0] += 1e-6
+                save_file(state, weights)
+
+    monkeypatch.setattr(runs, "run_processes", work_and_tamper)
+    sizes = {"copies": 1, "test_episodes": 1, "paper_episodes": 1, "split": "validation"}
+    settings = SimpleNamespace(task="balance_reaching", policy="feedforward", **sizes, **vars(SETTINGS))
+    episodes = dict.fromkeys(("train", "eval"), make_episodes())
+    with pytest.raises(ValueError, match=message):
+        frozen.train_policies(make_model(), episodes, CONSTANTS, tmp_path, settings, [0, 1])
+    assert (tmp_path / f"seed_{seed}/eval.json").exists()
+    assert (tmp_path / "seed_1/eval.json").exists() is (seed == 1)
+
+
+def test_bfloat16_is_only_for_processors_that_compute_with_it(monkeypatch):
+    monkeypatch.setattr(torch.backends.mkldnn, "is_available", lambda: False)
+    ones = torch.ones(2, 2)
+    with mixed_precision(ones.device):
+        assert (ones @ ones).dtype == torch.float32
+
+
 def test_features_are_the_plain_episodes_first_then_the_copies():
     model = make_model().eval()
     episodes = make_episodes()
     features = compute_features(model, episodes, 2, torch.Generator().manual_seed(0))
     assert features.shape == (9, 12)
-    assert torch.equal(features["action"][:3], episodes["action"])
+    for key in ("action", "goal"):
+        assert torch.equal(features[key][:3], episodes[key])
     assert not features["disturbed"][:3].any()
-    assert torch.equal(features["action"][:3], episodes["action"])
     assert not torch.equal(features["latent"][3:6], features["latent"][:3])
     with torch.no_grad():
         torch.testing.assert_close(features["latent"][:3], model.encode(episodes["pixels"]))

@@ -29,7 +29,7 @@ from .demonstrations import Plan, plan_demonstrations, plan_exploration, roll_ou
 from .loading import META, load_meta
 from .writing import merge_datasets, write_episodes
 
-FORMAT = 1
+FORMAT = 2  # of what is recorded, and how: a recording of another is another one
 ROWS = "episodes.json"  # a shard's rows of the metadata
 KINDS = ("demonstrations", "exploration")
 SHARD_EPISODES = 25
@@ -76,7 +76,7 @@ def record_dataset(
 
     root = Path(root).expanduser()
     settings = {"task": task, "kind": kind, "episodes": episodes, "eval_episodes": eval_episodes}
-    settings["expert"] = str(expert or task)
+    settings |= {"expert": str(expert or task), "format": FORMAT}
     _check_settings(root, settings)
     parts = root.with_name(f"{root.name}.parts")
     if (root / META).exists() and not parts.exists():
@@ -137,16 +137,15 @@ def _check_settings(root: Path, settings: dict) -> None:
     if (root / META).exists():
         meta = load_meta(root)
         sizes = {name: end - first for name, (first, end) in meta["splits"].items()}
-        stored = {"task": meta["task"], "kind": meta["kind"], "expert": meta.get("expert", meta["task"])}
+        stored = {name: meta.get(name) for name in ("task", "kind", "expert", "format")}
         stored |= {"episodes": sizes["train"], "eval_episodes": sizes["eval"]}
     elif root.exists() and (not root.is_dir() or any(root.iterdir())):
         raise ValueError(f"{root} exists and is no dataset of ours; choose another folder or delete it")
     elif (parts := root.with_name(f"{root.name}.parts") / "settings.json").exists():
         stored = read_json(parts)
-        stored.setdefault("expert", stored["task"])
     if stored not in (None, settings):
         changed = ", ".join(
-            f"{k}: {stored[k]} there, {v} here" for k, v in settings.items() if stored[k] != v
+            f"{k}: {stored.get(k)} there, {v} here" for k, v in settings.items() if stored.get(k) != v
         )
         raise ValueError(f"{root} holds another recording ({changed}); choose another folder or delete it")
 
@@ -262,8 +261,7 @@ def _merge(shards: list[Shard], folder: Path, settings: dict) -> None:
     episodes = merge_datasets([s.folder for s in shards], folder, splits)
     if episodes.shape != (len(rows), EPISODE_STEPS):
         raise OSError(f"{folder} holds {tuple(episodes.shape)} episodes and steps after merging")
-    known = {name: settings[name] for name in ("task", "expert", "kind")}
-    meta = {"format": FORMAT, **known, "splits": splits}
+    meta = {name: settings[name] for name in ("format", "task", "expert", "kind")} | {"splits": splits}
     meta["normalization"] = normalization_constants(episodes[:train])
     meta["episodes"] = [{"episode_index": i, **row} for i, row in enumerate(rows)]
     write_json(folder / META, meta)

@@ -95,6 +95,10 @@ def way_around(scene: ObstacleScene, start: Point, goal: Point) -> list[Point]:
     return list(dict.fromkeys((start, *min(ways, key=length), goal)))
 
 
+def way_from_start(scene: ObstacleScene) -> list[Point]:
+    return way_around(scene, (scene.cart_x, scene.cart_y), (scene.goal_x, scene.goal_y))
+
+
 def length(way: list[Point]) -> float:
     return sum(map(math.dist, way, way[1:]))
 

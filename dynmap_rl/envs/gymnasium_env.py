@@ -143,7 +143,7 @@ class DynmapEnv(gym.Env):
         pixels = self._frames.draw(self.world, self.task).copy()
         if self.obs_type == "pixels":
             return pixels
-        return {"pixels": pixels, "agent_pos": agent_pos(self.world)}
+        return {"pixels": pixels, "agent_pos": agent_pos(self.world, self.task)}
 
     def _info(self) -> dict[str, np.generic]:
         return {
@@ -154,6 +154,6 @@ class DynmapEnv(gym.Env):
         }
 
 
-def agent_pos(world) -> np.ndarray:
+def agent_pos(world, task) -> np.ndarray:
     """What a policy may know beside the frame, float32 ``[5]``: commanded cart pose and goal."""
-    return np.concatenate([world.commanded, world.goal]).astype(np.float32)
+    return np.concatenate([world.commanded, task.goal(world)]).astype(np.float32)

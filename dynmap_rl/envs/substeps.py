@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import platform
 import sys
 from collections.abc import Callable
 
@@ -22,21 +23,30 @@ def run_plain(
 ) -> None:
     """Step the space ``steps`` times by ``dt`` (s); in each the cart moves at the velocity of the substep's middle."""
     for i in range(steps):
-        middle = (i + 0.5) / steps
-        x, y, angular = (b + (a - b) * middle for b, a in zip(before, after, strict=True))
-        cart.velocity = (x, y)
-        cart.angular_velocity = angular
-        space.step(dt)
+        _step(space, cart, before, after, (i + 0.5) / steps, dt)
+
+
+def _step(space, cart, before, after, middle: float, dt: float) -> None:
+    x, y, angular = (b + (a - b) * middle for b, a in zip(before, after, strict=True))
+    cart.velocity = (x, y)
+    cart.angular_velocity = angular
+    space.step(dt)
 
 
 @functools.cache
 def choose_run() -> Run:
     """The compiled form of :func:`run_plain`, or that itself where it cannot be compiled."""
-    if sys.platform == "win32":  # where a C vector is not passed as its two numbers
-        return run_plain
+    machine = platform.machine().lower()
+    # Here a C vector is passed as its two numbers.
+    known = sys.platform in ("linux", "darwin") and machine in ("x86_64", "arm64", "aarch64")
     try:
-        return _compile()
-    except (ImportError, AttributeError, RuntimeError):  # another release of LLVM's bindings or of PyMunk
+        return _compile() if known else run_plain
+    except (
+        ImportError,
+        AttributeError,
+        OSError,
+        RuntimeError,
+    ):  # other releases of LLVM's bindings or of PyMunk
         return run_plain
 
 
@@ -57,6 +67,7 @@ define void @run(i8* %space, i8* %cart, double %bx, double %by, double %bw,
                  double %ax, double %ay, double %aw, i64 %steps, double %dt) {
 start:
   %count = sitofp i64 %steps to double
+  %last = sub i64 %steps, 1
   br label %substep
 substep:
   %i = phi i64 [ 0, %start ], [ %next, %substep ]
@@ -70,7 +81,7 @@ substep:
   call void @cpBodySetAngularVelocity(i8* %cart, double %w)
   call void @cpSpaceStep(i8* %space, double %dt)
   %next = add i64 %i, 1
-  %more = icmp slt i64 %next, %steps
+  %more = icmp slt i64 %next, %last
   br i1 %more, label %substep, label %end
 end:
   ret void
@@ -96,7 +107,13 @@ def _compile() -> Run:
     loop = ctypes.CFUNCTYPE(None, *signature)(engine.get_function_address("run"))
 
     def run_compiled(space, cart, before, after, steps, dt) -> None:
-        loop(address(space._space), address(cart._body), *before, *after, steps, dt)
+        # The last substep is PyMunk's own, which does what callbacks asked for: to add and to remove shapes.
+        space._locked = True
+        try:
+            loop(address(space._space), address(cart._body), *before, *after, steps, dt)
+        finally:
+            space._locked = False
+        _step(space, cart, before, after, (steps - 0.5) / steps, dt)
 
     run_compiled.engine = engine  # owns the machine code
     return run_compiled

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import math
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -39,6 +40,7 @@ from .world import ACCELERATION_LIMIT, CONTROL_DT, EPISODE_STEPS, VELOCITY_LIMIT
 SUCCESS_DISTANCE = 0.05  # m, about 3 pixels
 MARKER_SIZE = 0.04  # m
 REST_SPEED = 0.02  # m/s
+X_SPEED, Y_SPEED, SPIN = VELOCITY_LIMIT.tolist()
 
 
 class BalanceReaching:
@@ -55,6 +57,7 @@ class BalanceReaching:
     description = "Carry the free-standing block to the green goal without dropping it."
     state_size = 16
     ranges = SceneRanges()
+    symmetric = True  # mirrored and shifted demonstrations are demonstrations
     pushes = 6  # in a disturbed demonstration, which shows how to recover from them
 
     def sample_scene(self, rng: np.random.Generator, ranges: SceneRanges | None = None) -> Scene:
@@ -74,34 +77,30 @@ class BalanceReaching:
         Goal relative to the cart (2), cart pose (3) and velocity (3), block pose (3) and velocity (3) relative to
         the cart, cart width, block height.
         """
-        s = world.scene
+        # Plain numbers throughout: arrays of two or three take ten times as long.
+        s, (goal_x, goal_y) = world.scene, world.goal.tolist()
         x, y, tilt = world.block_in_cart
         cart_x, cart_y, theta = world.position[:3].tolist()
-        vx, vy, spin = (world.velocity[:3] / VELOCITY_LIMIT).tolist()
-        relative = world.velocity[3:] - world.velocity[:3]
-        standing = (s.cart_height + s.block_height) / 2
-        state = np.array(
-            [
-                2 * (world.goal[0] - cart_x),
-                2 * (world.goal[1] - cart_y),
-                2 * (cart_x - 0.5),
-                2 * (cart_y - 0.5),
-                2 * theta,
-                vx,
-                vy,
-                spin,
-                10 * x,
-                10 * (y - standing),
-                2 * tilt,
-                5 * relative[0],
-                5 * relative[1],
-                relative[2],
-                20 * (s.cart_width - 0.25),
-                20 * (s.block_height - 0.16),
-            ],
-            dtype=np.float32,
+        vx, vy, spin, block_vx, block_vy, block_spin = world.velocity.tolist()
+        values = (
+            2 * (goal_x - cart_x),
+            2 * (goal_y - cart_y),
+            2 * (cart_x - 0.5),
+            2 * (cart_y - 0.5),
+            2 * theta,
+            vx / X_SPEED,
+            vy / Y_SPEED,
+            spin / SPIN,
+            10 * x,
+            10 * (y - (s.cart_height + s.block_height) / 2),
+            2 * tilt,
+            5 * (block_vx - vx),
+            5 * (block_vy - vy),
+            block_spin - spin,
+            20 * (s.cart_width - 0.25),
+            20 * (s.block_height - 0.16),
         )
-        return state.clip(-10.0, 10.0)
+        return clipped(values)
 
     def reward(self, world: World) -> float:
         if world.dropped:
@@ -111,8 +110,7 @@ class BalanceReaching:
 
     def effort(self, world: World) -> float:
         """The penalty on acceleration and tilt of the cart."""
-        squared = float(np.square(world.acceleration[:3] / ACCELERATION_LIMIT).sum())
-        return 0.02 * squared + 0.1 * min(abs(world.position[2]), 1.0)
+        return 0.02 * squared(world.acceleration, ACCELERATION_LIMIT) + 0.1 * min(abs(world.position[2]), 1.0)
 
     def is_over(self, world: World) -> bool:
         """Whether the episode has failed for good, before its 120 steps have passed."""
@@ -142,6 +140,7 @@ class BalanceReachingObstacle(BalanceReaching):
     description = "Carry the free-standing block around the obstacle to the green goal without dropping it."
     state_size = 20
     ranges = ObstacleRanges()
+    symmetric = False  # the obstacle has its place
 
     def sample_scene(self, rng: np.random.Generator, ranges: SceneRanges | None = None) -> Scene:
         for _ in range(1000):
@@ -196,14 +195,15 @@ class BinDropping(BalanceReaching):
     missed or the cart touched the bin; before that ``0.2 exp(-4 d)`` for a distance d (m) of block and goal; always
     less a small penalty on the cart's acceleration. It is shaped: the paper's has the 1 and the -1 alone.
 
-    Success: the block rests in the bin, its centre between the walls and below their top, slower than 20 mm/s
-    in this step and the one before, and the cart never touched the bin.
+    Success: the block, no longer carried, rests in the bin, its centre between the walls and below their top, slower
+    than 20 mm/s in this step and the one before, and the cart never touched the bin.
     """
 
     name = "bin_dropping"
     description = "Tip the free-standing block into the green bin."
     state_size = 20
     ranges = BinRanges()
+    symmetric = False  # the expert always tips the block to one side
     pushes = 3
 
     def make_world(self, scene: BinScene) -> World:
@@ -213,21 +213,20 @@ class BinDropping(BalanceReaching):
         """As in task 1, then the goal relative to the block (2), the bin's width and its depth, ``[20]``."""
         s = world.scene
         x, y = (world.goal - world.position[3:5]).tolist()
-        values = np.array(
-            [2 * x, 2 * y, 20 * (s.bin_width - 0.28), 20 * (s.bin_depth - 0.12)], dtype=np.float32
-        )
-        return np.concatenate([super().state(world), values.clip(-10.0, 10.0)])
+        values = 2 * x, 2 * y, 20 * (s.bin_width - 0.28), 20 * (s.bin_depth - 0.12)
+        return np.concatenate([super().state(world), clipped(values)])
 
     def reward(self, world: World) -> float:
         if self.is_over(world):
             return -1.0
-        effort = float(np.square(world.acceleration[:3] / ACCELERATION_LIMIT).sum())
+        effort = squared(world.acceleration, ACCELERATION_LIMIT)
         if self.is_in_bin(world):
-            motion = float(np.square(world.velocity[:3] / VELOCITY_LIMIT).sum())
+            motion = squared(world.velocity, VELOCITY_LIMIT)
             return 1.0 - 0.02 * effort - 0.1 * motion - 0.2 * min(abs(world.position[2]), 1.0)
         return 0.2 * math.exp(-4 * math.dist(world.position[3:5], world.goal)) - 0.02 * effort
 
     def is_in_bin(self, world: World) -> bool:
+        """Whether the block's centre is between the walls and below their top."""
         s, (x, y) = world.scene, world.position[3:5].tolist()
         return abs(x - s.goal_x) < s.bin_width / 2 and s.goal_y - s.bin_depth < y < s.goal_y
 
@@ -239,10 +238,21 @@ class BinDropping(BalanceReaching):
         now = world.velocity[3:5]
         before = now - world.acceleration[3:5] * CONTROL_DT
         rests = max(np.linalg.norm(now), np.linalg.norm(before)) < REST_SPEED
-        return bool(rests) and self.is_in_bin(world) and "cart" not in world.touched
+        tipped = world.dropped and "cart" not in world.touched
+        return bool(rests) and tipped and self.is_in_bin(world)
 
     def markers(self, scene: BinScene) -> list[tuple[Polygon, Color]]:
         return [(wall_polygon(*wall), GOAL_COLOR) for wall in bin_walls(scene)]
+
+
+def clipped(values: Iterable[float]) -> np.ndarray:
+    """As float32, each within [-10, 10]."""
+    return np.array([min(max(v, -10.0), 10.0) for v in values], dtype=np.float32)
+
+
+def squared(dynamics: np.ndarray, limits: np.ndarray) -> float:
+    """The sum of squares of the cart's three entries, in units of their limits."""
+    return sum((v / limit) ** 2 for v, limit in zip(dynamics[:3].tolist(), limits.tolist(), strict=True))
 
 
 TASKS = {task.name: task for task in (BalanceReaching(), BalanceReachingObstacle(), BinDropping())}

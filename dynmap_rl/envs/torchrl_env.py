@@ -10,7 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from .gymnasium_env import ACTION_LIMITS, agent_pos
+from .gymnasium_env import ACTION_LIMITS
 from .renderer import Renderer
 from .scene import SceneRanges
 from .tasks import choose_ranges, get_task
@@ -38,6 +38,7 @@ class DynmapBatchedEnv(EnvBase):
         control: ``position`` or ``acceleration`` (see ``DynmapEnv``).
         ranges: what scenes are drawn from; by default the task's own.
         seed: of the scenes.
+        pixels_only: leave ``state`` out, which takes time to compute and no policy on pixels may see.
     """
 
     batch_locked = True
@@ -51,16 +52,20 @@ class DynmapBatchedEnv(EnvBase):
         ranges: SceneRanges | None = None,
         seed: int | None = None,
         device: torch.device | str = "cpu",
+        pixels_only: bool = False,
     ):
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
         if control not in ACTION_LIMITS:
             raise ValueError(f"unknown control {control!r}; choose from {sorted(ACTION_LIMITS)}")
+        if pixels_only and not from_pixels:
+            raise ValueError("pixels_only needs from_pixels: nothing would be observed")
         super().__init__(device=device, batch_size=[num_envs])
         self.task = get_task(task)
         self.control = control
         self.ranges = choose_ranges(self.task, ranges)
         self.renderer = Renderer() if from_pixels else None
+        self.pixels_only = pixels_only
         self.worlds: list[World | None] = [None] * num_envs
         self._make_specs()
         self.set_seed(seed)
@@ -73,13 +78,14 @@ class DynmapBatchedEnv(EnvBase):
 
         dynamics = {name: unbounded(6) for name in ("position", "velocity", "acceleration")}
         observation = {
-            "state": unbounded(self.task.state_size),
             "agent_pos": unbounded(5),
             "goal": unbounded(len(self.task.goal(self.task.make_world(_any_scene(self))))),
             "dynamics": Composite(dynamics, shape=(n,), device=device),
             "position_error": unbounded(1),
             **{name: Binary(1, (n, 1), dtype=torch.bool, device=device) for name in EVENTS},
         }
+        if not self.pixels_only:
+            observation["state"] = unbounded(self.task.state_size)
         if self.renderer:
             observation["pixels"] = Bounded(0, 255, (n, 3, 64, 64), dtype=torch.uint8, device=device)
         self.observation_spec = Composite(observation, shape=(n,), device=device)
@@ -115,22 +121,25 @@ class DynmapBatchedEnv(EnvBase):
                 world.step(action)
             else:
                 world.accelerate(action)
-        reward = np.array([self.task.reward(world) for world in self.worlds], dtype=np.float32)
-        return self._observe().update(self._done()).set("reward", self._tensor(reward[:, None]))
+        reward = self._stack([self.task.reward(world)] for world in self.worlds)
+        return self._observe().update(self._done()).set("reward", reward)
 
     def _observe(self) -> TensorDict:
         worlds, task = self.worlds, self.task
         names = ("position", "velocity", "acceleration")
+        commanded = self._stack(w.commanded for w in worlds)
+        goals = self._stack(task.goal(w) for w in worlds)
         data = {
-            "state": self._tensor(np.stack([task.state(w) for w in worlds])),
-            "agent_pos": self._tensor(np.stack([agent_pos(w) for w in worlds])),
-            "goal": self._tensor(np.stack([task.goal(w) for w in worlds])),
-            "dynamics": {k: self._tensor(np.stack([getattr(w, k) for w in worlds])) for k in names},
-            "position_error": self._tensor(np.array([[w.position_error] for w in worlds])),
+            "agent_pos": torch.cat([commanded, goals], 1),
+            "goal": goals,
+            "dynamics": {k: self._stack(getattr(w, k) for w in worlds) for k in names},
+            "position_error": self._stack([w.position_error] for w in worlds),
             "dropped": self._flag(w.dropped for w in worlds),
             "touched": self._flag(bool(w.touched) for w in worlds),
             "is_success": self._flag(task.is_success(w) for w in worlds),
         }
+        if not self.pixels_only:
+            data["state"] = self._stack(task.state(w) for w in worlds)
         if self.renderer:
             frames = np.stack([self.renderer.draw(w, task) for w in worlds])
             data["pixels"] = torch.from_numpy(frames).permute(0, 3, 1, 2).to(self.device)
@@ -142,10 +151,12 @@ class DynmapBatchedEnv(EnvBase):
         return {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
 
     def _flag(self, values: Iterable[bool]) -> torch.Tensor:
-        return torch.tensor([[value] for value in values], device=self.device)
+        """``[N, 1]``"""
+        return torch.tensor(list(values), device=self.device).unsqueeze(1)
 
-    def _tensor(self, array: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(array.astype(np.float32, copy=False)).to(self.device)
+    def _stack(self, rows: Iterable) -> torch.Tensor:
+        """float32 ``[N, ...]``"""
+        return torch.from_numpy(np.array(list(rows), dtype=np.float32)).to(self.device)
 
 
 def _any_scene(env: DynmapBatchedEnv):

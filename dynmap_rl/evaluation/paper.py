@@ -33,6 +33,17 @@ TABLES = {
         "RGB+[V+A]": ((8, 4.3), (28, 7.0), (82, 7.1)),
         "RGB+[P+V+A]": ((5, 0.9), (25, 2.2), (87, 1.9)),
     },
+    ("balance_reaching", "joint", "recurrent"): {
+        "End-to-End": ((19, 9.0), (71, 21.9), (57, 10.6)),
+        "Only-RGB": ((17, 5.0), (92, 31.4), (64, 5.9)),
+        "RGB+[P]": ((5, 0.9), (58, 17.1), (67, 8.1)),
+        "RGB+[V]": ((22, 6.5), (84, 31.6), (51, 10.9)),
+        "RGB+[A]": ((15, 3.8), (43, 4.1), (65, 3.8)),
+        "RGB+[P+V]": ((9, 1.9), (54, 11.0), (59, 9.6)),
+        "RGB+[P+A]": ((6, 4.3), (34, 2.1), (79, 6.2)),
+        "RGB+[V+A]": ((19, 0.9), (48, 6.1), (57, 5.7)),
+        "RGB+[P+V+A]": ((7, 2.5), (43, 7.2), (70, 8.6)),
+    },
     ("balance_reaching_obstacle", "decoupled", "recurrent"): {
         "Only-RGB": ((1, 0.9), (80, 5.9)),
         "RGB+[P]": ((0, 0.0), (91, 3.8)),
@@ -84,17 +95,20 @@ def paper_numbers(result: dict) -> dict[str, tuple[float, float]] | None:
     Args:
         result: an ``eval.json``.
     """
-    source = result.get("world_model", {"task": result["task"], "training": "decoupled"})
+    source = result["world_model"]
     if source["task"] != "balance_reaching":
         return None
-    table = TABLES.get((result["task"], source["training"], result["policy"]), {})
+    column = "decoupled" if source["training"] == "decoupled" else "joint"  # which has the row End-to-End
+    table = TABLES.get((result["task"], column, result["policy"]), {})
     if result["row"] not in table:
         return None
     return dict(zip(METRICS[result["task"]], table[result["row"]], strict=True))
 
 
-def row_name(supervision: Iterable[str]) -> str:
-    """The paper's name of a supervision: ``("position", "velocity")`` is ``RGB+[P+V]``, none is ``Only-RGB``."""
+def row_name(supervision: Iterable[str], training: str = "decoupled") -> str:
+    """The paper's name of a row: ``("position", "velocity")`` is ``RGB+[P+V]``, none is ``Only-RGB``."""
+    if training == "end_to_end":
+        return "End-to-End"
     letters = [q[0].upper() for q in DYNAMICS if q in supervision]
     return f"RGB+[{'+'.join(letters)}]" if letters else "Only-RGB"
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+import numpy as np
 from tensordict import TensorDictBase
 
 from dynmap_rl.data import load_meta
@@ -47,10 +48,10 @@ def write_report(
     folder: Path,
     settings,
     dataset,
-    world_model,
+    world_model: WorldModel,
     episodes: TensorDictBase,
-    seeds,
-    frozen,
+    seeds: list[int],
+    frozen: str | None = None,
     source: dict | None = None,
 ) -> dict:
     """Collect the seeds' results into ``eval.json`` and draw the figures.
@@ -59,7 +60,7 @@ def write_report(
         folder: run folder with ``seed_N/eval.json`` and ``seed_N/policy``.
         settings: the recipe's dataclass.
         dataset: what was trained on.
-        world_model: the frozen one; ``frozen`` is its fingerprint.
+        world_model: the frozen one, of which ``frozen`` is the fingerprint, or that of the first seed.
         episodes: held-out demonstrations ``[E, T]``, for the figures.
         seeds: of the policies.
         source: where the world model is from, with its ``task`` and ``training``; by default this very run.
@@ -68,26 +69,28 @@ def write_report(
 
     meta = load_meta(dataset)
     results = [read_json(folder / f"seed_{seed}" / "eval.json") for seed in seeds]
-    if any(r["world_model_sha256"] != frozen for r in results):
+    if frozen and any(r["world_model_sha256"] != frozen for r in results):
         raise ValueError(f"seeds in {folder} belong to another world model; delete the folder and run again")
+    source = source or {"task": settings.task, "training": "decoupled"}
     test = [_rows(r["test"]["rows"]) for r in results]
     result = {
-        "row": row_name(world_model.supervision),
+        "row": row_name(world_model.supervision, source["training"]),
         "policy": settings.policy,
         "task": settings.task,
         "trained_on": {"dataset": str(dataset), "kind": meta["kind"], "episodes": meta["splits"]["train"][1]},
-        "world_model": source or {"task": settings.task, "training": "decoupled"},
+        "world_model": source,
         "seeds": list(seeds),
         "world_model_sha256": frozen,
         "paper_protocol": summarize_seeds([_rows(r["paper"]["rows"]) for r in results]),
-        "test_protocol": summarize([row for rows in test for row in rows]),
+        "test_protocol": summarize([row for rows in test for row in rows]) | _localization(results),
         "settings": {
             k: str(v) if isinstance(v, Path) else v for k, v in dataclasses.asdict(settings).items()
         },
         "command": command_line(),
         "results": results,
     }
-    plot_reconstruction(world_model, episodes[:3], folder / "figures" / "reconstruction.png")
+    if source["training"] != "end_to_end":  # whose decoders are not trained
+        plot_reconstruction(world_model, episodes[:3], folder / "figures" / "reconstruction.png")
     plot_dynamics(world_model, episodes[0], folder / "figures" / "dynamics.png")
     policy = load_policy(folder / f"seed_{seeds[0]}" / "policy")
     some = [scene_seed("validation", i) for i in range(8)]
@@ -95,6 +98,12 @@ def write_report(
     save_gif(rollouts, folder / "rollouts.gif")
     write_json(folder / "eval.json", result)
     return result
+
+
+def _localization(results: list[dict]) -> dict[str, float]:
+    """How well the world model finds the cart (mm), over all seeds; rows do not tell it."""
+    names = [name for name in results[0]["test"]["summary"] if name.startswith("localization")]
+    return {name: float(np.mean([r["test"]["summary"][name] for r in results])) for name in names}
 
 
 def read_rows(path: Path) -> list[list[dict]]:
@@ -116,23 +125,25 @@ def print_row(result: dict) -> None:
 
 def markdown_row(result: dict) -> str:
     """The row of the README's table: the paper's numbers, ours by its protocol, ours on the shared start states."""
-    ours, test, paper = result["paper_protocol"], result["test_protocol"], paper_numbers(result)
-    low, high = test["SR_interval"]
-    metrics = _metrics(result)
-    cells = [
-        f"{_label(result)}, {result['policy']}",
-        _short(paper) if paper else "-",
-        _short({name: ours[name] for name in metrics}),
-        *(f"{test[name]:.1f}" for name in metrics if name != "SR"),
-        f"**{test['SR']:.1f}** [{low:.1f}, {high:.1f}]",
-    ]
-    return f"| {' | '.join(cells)} |"
+    test = result["test_protocol"]
+    paper, ours, rate = row_cells(result)
+    others = [f"{test[name]:.1f}" for name in _metrics(result) if name != "SR"]
+    return f"| {' | '.join([f'{_label(result)}, {result["policy"]}', paper, ours, *others, rate])} |"
+
+
+def row_cells(result: dict) -> tuple[str, str, str]:
+    """The paper's numbers, ours by its protocol, and our SR on the shared start states, as text."""
+    paper, (low, high) = paper_numbers(result), result["test_protocol"]["SR_interval"]
+    ours = {name: result["paper_protocol"][name] for name in _metrics(result)}
+    rate = f"**{result['test_protocol']['SR']:.1f}** [{low:.1f}, {high:.1f}]"
+    return _short(paper) if paper else "-", _short(ours), rate
 
 
 def _label(result: dict) -> str:
-    """The row's name, with the world model's task where it is another."""
-    source = result.get("world_model", result)["task"]
-    return result["row"] if source == result["task"] else f"{result['row']} of {source}"
+    """The row's name, with what its world model is from where that is not the decoupled training on the same task."""
+    source = result["world_model"]
+    label = f"{result['row']}, joint" if source["training"] == "joint" else result["row"]
+    return label if source["task"] == result["task"] else f"{label} of {source['task']}"
 
 
 def _metrics(result: dict) -> tuple[str, ...]:
@@ -149,9 +160,19 @@ def _cells(numbers: dict) -> str:
     return "   ".join(f"{name} {mean:.0f} ({std:.1f}) {UNITS[name]}" for name, (mean, std) in numbers.items())
 
 
-def _columns(rows: list[dict]) -> dict[str, list]:
-    return {key: [row[key] for row in rows] for key in rows[0]}
+FLAGS = "success", "dropped", "touched"
 
 
-def _rows(columns: dict[str, list]) -> list[dict]:
-    return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
+def _columns(rows: list[dict]) -> dict:
+    """Rows of scenes in a row, as short as they can be told: flags as text of 0 and 1, and the first scene's seed."""
+    columns = {flag: "".join(str(int(row[flag])) for row in rows) for flag in FLAGS}
+    errors = [round(row["position_error"], 4) for row in rows]
+    return {"first_scene_seed": rows[0]["scene_seed"], **columns, "position_error": errors}
+
+
+def _rows(columns: dict) -> list[dict]:
+    flags = [[flag == "1" for flag in columns[name]] for name in FLAGS]
+    values = zip(*flags, columns["position_error"], strict=True)
+    names = "scene_seed", *FLAGS, "position_error"
+    first = columns["first_scene_seed"]
+    return [dict(zip(names, (first + i, *row), strict=True)) for i, row in enumerate(values)]

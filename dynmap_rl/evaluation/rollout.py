@@ -28,7 +28,7 @@ def roll_out(actor: Actor, task: str, seeds: list[int], keep_pixels: bool = Fals
         these rollouts (zeros at t = 0).
     """
     actor = actor.eval()
-    env = DynmapBatchedEnv(task, len(seeds), from_pixels=True)
+    env = DynmapBatchedEnv(task, len(seeds), from_pixels=True, pixels_only=True)
     td = env.reset(TensorDict({"scene_seed": torch.tensor(seeds)}, [len(seeds)]))
     keys = [
         "action",

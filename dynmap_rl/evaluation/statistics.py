@@ -8,7 +8,7 @@ from scipy.stats import binomtest, bootstrap
 
 def summarize(rows: list[dict]) -> dict[str, float]:
     """DR and SR in %, PE in mm (paper, Sec. V-B), over any number of episode rows, with 95 % Wilson intervals; and
-    where walls were touched, the share of episodes in % (``touched``)."""
+    the share of episodes in which a wall was touched, in % (``touched``)."""
     count = len(rows)
     dropped = sum(row["dropped"] for row in rows)
     success = sum(row["success"] for row in rows)
@@ -20,7 +20,7 @@ def summarize(rows: list[dict]) -> dict[str, float]:
         "SR": 100 * success / count,
         "SR_interval": wilson(success, count),
     }
-    if any(row.get("touched") for row in rows):
+    if "touched" in rows[0]:
         summary["touched"] = 100 * sum(row["touched"] for row in rows) / count
     if "localization_error" in rows[0]:
         summary["localization"] = 1000 * float(np.mean([row["localization_error"] for row in rows]))

@@ -1,5 +1,5 @@
 """State-based PPO experts."""
 
-from .policy import ExpertNetwork, list_checkpoints, load_expert, make_actor, roll_out
+from .policy import ExpertNetwork, find_expert, list_checkpoints, load_expert, make_actor, roll_out
 
-__all__ = ["ExpertNetwork", "list_checkpoints", "load_expert", "make_actor", "roll_out"]
+__all__ = ["ExpertNetwork", "find_expert", "list_checkpoints", "load_expert", "make_actor", "roll_out"]

@@ -56,21 +56,28 @@ class WorldModelLoss(LossModule):
         self.stop_gradient, self.rgb_steps = stop_gradient, rgb_steps
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        model, keys = self.world_model, self.tensor_keys
-        pixels = tensordict.get(keys.pixels)
-        latent = model.encode(pixels).float()  # (B, T, Z)
+        return TensorDict(self.compare(tensordict, *self.predict(tensordict)), [])
+
+    def predict(self, tensordict: TensorDictBase) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
+        """The latents ``[B, T, Z]``, and ``predicted_latent``, ``hidden1``, ``hidden2`` at every t."""
+        latent = self.world_model.encode(tensordict.get(self.tensor_keys.pixels)).float()
         with torch.autocast(latent.device.type, enabled=False):
-            states = model.predict(latent, tensordict.get(keys.action))
+            return latent, self.world_model.predict(latent, tensordict.get(self.tensor_keys.action))
+
+    def compare(self, tensordict: TensorDictBase, latent: torch.Tensor, states) -> dict[str, torch.Tensor]:
+        """The losses by name, for what :meth:`predict` gave."""
+        model, keys = self.world_model, self.tensor_keys
         predicted, hidden1, hidden2 = (x[:, 1:] for x in states)  # (B, T-1, .)
+        pixels = tensordict.get(keys.pixels)[:, 1:]
         losses = {
-            "loss_rgb": self._rgb_loss(pixels[:, 1:], predicted, hidden1, hidden2),
+            "loss_rgb": self._rgb_loss(pixels, predicted, hidden1, hidden2),
             "loss_latent": self.beta_z * self._latent_loss(latent, predicted),
         }
         for name, value in model.decode_dynamics(predicted, hidden1, hidden2).items():
             scale = model.dynamics_decoder.normalizers[name].scale
             truth = tensordict.get((keys.dynamics, name))[:, 1:]
             losses[f"loss_{name}"] = self.beta_dynamics * rms((value - truth) / scale).mean()
-        return TensorDict(losses, [])
+        return losses
 
     def _latent_loss(self, latent, predicted) -> torch.Tensor:
         before, target = latent[:, :-1], latent[:, 1:]

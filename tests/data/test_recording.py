@@ -18,7 +18,7 @@ from tensordict import TensorDict
 from dynmap_rl.data import load_dataset, load_meta, normalization_constants, record_dataset
 from dynmap_rl.data import recording as module
 from dynmap_rl.data.writing import FEATURES
-from dynmap_rl.envs import sample_scene
+from dynmap_rl.envs.tasks import TASKS, get_task
 from dynmap_rl.envs.world import VELOCITY_LIMIT
 from dynmap_rl.experts import list_checkpoints
 from dynmap_rl.runs import write_json
@@ -30,17 +30,20 @@ def files(root) -> dict[str, bytes]:
     return {str(p.relative_to(root)): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
 
 
-def test_metadata_tells_how_every_episode_was_made(recording):
+@pytest.mark.parametrize("name", TASKS)
+def test_metadata_tells_how_every_episode_was_made(recordings, name):
+    recording, task = recordings(name), get_task(name)
     meta = load_meta(recording)
-    assert (meta["format"], meta["task"], meta["kind"]) == (1, "balance_reaching", "demonstrations")
-    assert meta["expert"] == "balance_reaching"
+    assert (meta["format"], meta["task"], meta["expert"]) == (2, name, name)
+    assert meta["kind"] == "demonstrations"
     assert meta["splits"] == {"train": [0, 4], "eval": [4, 6]}
     rows = meta["episodes"]
     assert [row["episode_index"] for row in rows] == list(range(6))
     assert [row["split"] for row in rows] == ["train"] * 4 + ["eval"] * 2
-    assert all(row["success"] and not row["dropped"] for row in rows)
+    assert all(row["success"] and row["checkpoint"] in list_checkpoints(name) for row in rows)
+    assert all(row["dropped"] is (name == "bin_dropping") for row in rows)
     for row in rows:
-        scene = sample_scene(np.random.default_rng(row["scene_seed"]))
+        scene = task.sample_scene(np.random.default_rng(row["scene_seed"]))
         assert json.loads(json.dumps(scene.to_dict())) == row["scene"]
     seeds = {split: {r["scene_seed"] for r in rows if r["split"] == split} for split in ("train", "eval")}
     assert len(seeds["train"]) == 4 and len(seeds["eval"]) == 2
@@ -171,16 +174,11 @@ def test_a_complete_recording_is_left_as_it_is(recording):
     assert [p.name for p in recording.parent.iterdir()] == [recording.name]
 
 
-def test_a_recording_that_names_no_expert_is_of_the_shipped_one(recording, tmp_path):
-    """As the first ones were written."""
+def test_a_recording_of_another_format_is_refused(recording, tmp_path):
     root = shutil.copytree(recording, tmp_path / "old")
-    meta = load_meta(root)
-    del meta["expert"]
-    write_json(root / module.META, meta)
-    assert record_dataset(root, episodes=4, eval_episodes=2) == root
-    assert record_dataset(root, episodes=4, eval_episodes=2, expert="balance_reaching") == root
-    with pytest.raises(ValueError, match="expert: balance_reaching there, bin_dropping here"):
-        record_dataset(root, episodes=4, eval_episodes=2, expert="bin_dropping")
+    write_json(root / module.META, load_meta(root) | {"format": 1})
+    with pytest.raises(ValueError, match=r"another recording \(format: 1 there, 2 here\)"):
+        record_dataset(root, episodes=4, eval_episodes=2)
 
 
 def test_exploration_keeps_every_episode_and_has_scenes_of_its_own(tmp_path):
@@ -254,13 +252,18 @@ def test_a_folder_with_something_else_is_refused(tmp_path):
         record_dataset(tmp_path / "thesis.tex" / "dataset")
 
 
-@pytest.mark.parametrize("expert", [{"expert": "balance_reaching"}, {}], ids=["named", "as of old"])
-def test_unfinished_shards_of_other_settings_are_refused(tmp_path, expert):
-    write_json(
-        tmp_path / "d.parts" / "settings.json",
-        {"task": "balance_reaching", "kind": "exploration", "episodes": 4, "eval_episodes": 2, **expert},
-    )
-    with pytest.raises(ValueError, match="kind: exploration there"):
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"kind": "exploration"}, "kind: exploration there, demonstrations here"),
+        ({"format": 1}, "format: 1 there, 2 here"),
+    ],
+)
+def test_unfinished_shards_of_other_settings_are_refused(tmp_path, changes, message):
+    settings = {"task": "balance_reaching", "expert": "balance_reaching", "kind": "demonstrations"}
+    settings |= {"episodes": 4, "eval_episodes": 2, "format": 2, **changes}
+    write_json(tmp_path / "d.parts" / "settings.json", settings)
+    with pytest.raises(ValueError, match=rf"another recording \({message}\)"):
         record_dataset(tmp_path / "d", episodes=4, eval_episodes=2)
 
 

@@ -1,6 +1,5 @@
 """What is recorded is what happened, and belongs together row by row, in every task."""
 
-import json
 import shutil
 
 import numpy as np
@@ -15,19 +14,11 @@ from dynmap_rl.experts import list_checkpoints
 from dynmap_rl.experts.policy import find_expert
 
 DYNAMICS = ("position", "velocity", "acceleration")
-TASK, CHECKPOINTS = get_task("bin_dropping"), list_checkpoints("bin_dropping")
-SMALL = {"episodes": 2, "eval_episodes": 1, "workers": 1}
 
 
-@pytest.fixture(scope="module")
-def dropping(tmp_path_factory):
-    """2 + 1 demonstrations of task 3."""
-    return record_dataset(tmp_path_factory.mktemp("datasets") / "dropping", "bin_dropping", **SMALL)
-
-
-@pytest.fixture(params=["recording", "dropping"])
-def dataset(request):
-    return request.getfixturevalue(request.param)
+@pytest.fixture(params=TASKS)
+def dataset(request, recordings):
+    return recordings(request.param)
 
 
 def plan_of(row: dict) -> Plan:
@@ -94,18 +85,6 @@ def test_next_columns_come_after_the_action(dataset):
     assert not after["success"][:, 0].any()
 
 
-def test_recording_of_a_task_tells_what_it_is(dropping):
-    meta = load_meta(dropping)
-    assert (meta["task"], meta["expert"], meta["kind"]) == ("bin_dropping",) * 2 + ("demonstrations",)
-    assert meta["splits"] == {"train": [0, 2], "eval": [2, 3]}
-    assert all(row["success"] and row["checkpoint"] in CHECKPOINTS for row in meta["episodes"])
-    for row in meta["episodes"]:
-        scene = TASK.sample_scene(np.random.default_rng(row["scene_seed"]))
-        assert json.loads(json.dumps(scene.to_dict())) == row["scene"]
-    info = json.loads((dropping / "meta" / "info.json").read_text())
-    assert (info["total_episodes"], info["splits"]) == (3, {"train": "0:2", "eval": "2:3"})
-
-
 @pytest.mark.parametrize("task", TASKS)
 def test_pushes_are_as_many_as_the_task_says_and_most_of_them_early(task):
     plans = plan_demonstrations(task, "train", 0, 60)
@@ -121,16 +100,17 @@ def test_pushes_are_as_many_as_the_task_says_and_most_of_them_early(task):
 
 def test_expert_of_a_folder_is_recorded(tmp_path):
     """One shipped checkpoint in another folder, by another name, acts as ever."""
-    expert, shipped = tmp_path / "checkpoint", CHECKPOINTS[-1]
+    expert, shipped = tmp_path / "checkpoint", list_checkpoints("bin_dropping")[-1]
+    small = {"episodes": 2, "eval_episodes": 1, "workers": 1}
     expert.mkdir()
     for suffix in ("json", "safetensors"):
         shutil.copy(find_expert("bin_dropping") / f"{shipped}.{suffix}", expert / f"mine.{suffix}")
-    root = record_dataset(tmp_path / "d", "bin_dropping", **SMALL, expert=expert)
+    root = record_dataset(tmp_path / "d", "bin_dropping", **small, expert=expert)
     meta = load_meta(root)
     assert meta["expert"] == str(expert)
     assert {row["checkpoint"] for row in meta["episodes"]} == {"mine"}
     plans = [plan_of({**row, "checkpoint": shipped}) for row in meta["episodes"][:2]]
     assert torch.equal(load_dataset(root, "train")["action"], roll_out("bin_dropping", plans)["action"])
-    assert record_dataset(root, "bin_dropping", **SMALL, expert=str(expert)) == root
+    assert record_dataset(root, "bin_dropping", **small, expert=str(expert)) == root
     with pytest.raises(ValueError, match=f"expert: {expert} there, bin_dropping here"):
-        record_dataset(root, "bin_dropping", **SMALL)
+        record_dataset(root, "bin_dropping", **small)

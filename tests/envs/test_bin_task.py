@@ -69,6 +69,20 @@ def test_no_success_where_the_block_only_turns_back():
     assert not TASK.is_success(world)
 
 
+def test_no_success_while_the_block_is_carried():
+    """Although it is at rest and below the rim, on a cart that a wide bin has room for."""
+    sizes = {"cart_width": 0.20, "block_height": 0.12, "bin_width": 0.32, "bin_depth": 0.13}
+    world = TASK.make_world(SCENE.replace(cart_x=0.7, cart_y=0.5, **sizes))
+    way = 0.5 - 0.105  # to where the cart's centre is 35 mm above the floor
+    path = way * (1 - np.cos(np.linspace(0, np.pi, 90))) / 2
+    for dy in np.diff(path):
+        world.step([0.0, -dy, 0.0])
+    rows = watch(world, 20)
+    assert TASK.is_in_bin(world) and rows[-1]["speed"] < 0.002
+    assert world.touched == set() and not world.dropped
+    assert not any(row["success"] for row in rows)
+
+
 @pytest.mark.parametrize("x", [0.48, 0.92])
 def test_block_that_falls_beside_has_missed(x):
     rows = watch(release(x))

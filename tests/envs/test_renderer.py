@@ -66,13 +66,20 @@ def test_walls_are_drawn_where_they_stand(name, seed):
     assert not green[outside].any()
 
 
+def color_at(point, task, scene: Scene) -> tuple:
+    x, y = point
+    return tuple(Renderer().draw(task.make_world(scene), task)[int((1 - y) * 64), int(x * 64)])
+
+
 @pytest.mark.parametrize("name", TASKS)
 def test_cart_and_block_are_drawn_before_the_markers(name):
     task = get_task(name)
-    scene = task.ranges.scene(cart_x=0.5, cart_y=0.5, goal_x=0.5, goal_y=0.5)
-    frame = Renderer().draw(task.make_world(scene), task)
-    assert tuple(frame[31, 31]) == scene.cart_color
-    assert tuple(frame[32 - 5, 31]) == scene.block_color
+    scene = task.ranges.scene(cart_x=0.2, cart_y=0.8, goal_x=0.7, goal_y=0.3)
+    for polygon, _ in task.markers(scene):
+        x, y = middle = np.mean(polygon, 0)
+        assert color_at(middle, task, scene) == GOAL_COLOR
+        assert color_at(middle, task, scene.replace(cart_x=x, cart_y=y)) == scene.cart_color
+        assert color_at(middle, task, scene.replace(cart_x=x, cart_y=y - 0.1)) == scene.block_color
 
 
 @pytest.mark.parametrize("size", [64, 256])

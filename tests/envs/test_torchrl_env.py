@@ -43,10 +43,13 @@ def random_actions(count: int, steps: int, control: str = "position") -> torch.T
         {"num_envs": 3},
         {"num_envs": 2, "from_pixels": True},
         {"num_envs": 2, "from_pixels": True, "control": "acceleration"},
+        {"num_envs": 2, "from_pixels": True, "pixels_only": True},
     ],
 )
 def test_specs(task, arguments):
-    check_env_specs(DynmapBatchedEnv(task, **arguments), seed=0)
+    env = DynmapBatchedEnv(task, **arguments)
+    check_env_specs(env, seed=0)
+    assert ("state" in env.reset()) is not arguments.get("pixels_only", False)
 
 
 @every_task
@@ -170,6 +173,7 @@ def test_works_in_a_collector():
         ({"num_envs": 0}, "num_envs must be at least 1"),
         ({"control": "nope"}, "unknown control 'nope'"),
         ({"task": "nope"}, "unknown task 'nope'"),
+        ({"pixels_only": True}, "pixels_only needs from_pixels"),
     ],
 )
 def test_wrong_argument_raises(arguments, message):

@@ -1,5 +1,8 @@
+import numpy as np
+import pytest
 import torch
 
+from dynmap_rl.envs.tasks import TASKS, get_task
 from dynmap_rl.envs.world import EPISODE_STEPS
 from dynmap_rl.evaluation import episode_rows, evaluate, roll_out, scene_seeds
 from dynmap_rl.modules import Actor, make_policy, make_world_model
@@ -17,32 +20,45 @@ def make_actor():
     return Actor(model, make_policy(CONSTANTS, "feedforward", model, width=16))
 
 
-def test_an_episode_does_not_depend_on_the_others_in_its_batch():
-    actor, seeds = make_actor(), scene_seeds("validation", 3)
-    together = roll_out(actor, "balance_reaching", seeds)
-    alone = roll_out(actor, "balance_reaching", seeds[1:2])
+@pytest.fixture(scope="module", params=TASKS)
+def rolled(request):
+    """A task's name, the scenes' seeds, and the episodes of an untrained policy."""
+    seeds = scene_seeds("validation", 3)
+    return request.param, seeds, roll_out(make_actor(), request.param, seeds)
+
+
+def test_an_episode_does_not_depend_on_the_others_in_its_batch(rolled):
+    task, seeds, together = rolled
+    alone = roll_out(make_actor(), task, seeds[1:2])
     torch.testing.assert_close(together["action"][1], alone["action"][0], rtol=1e-3, atol=1e-5)
     assert together.shape == (3, EPISODE_STEPS)
 
 
-def test_rows_say_what_happened():
-    actor, seeds = make_actor(), scene_seeds("validation", 3)
-    episodes = roll_out(actor, "balance_reaching", seeds)
+def test_rows_say_what_happened(rolled):
+    task, seeds, episodes = rolled
     rows = episode_rows(episodes, seeds)
     distance = (episodes["dynamics", "position"][..., :2] - episodes["goal"]).norm(dim=-1)
-    for i, row in enumerate(rows):
+    for i, (row, actions) in enumerate(zip(rows, episodes["action"].numpy(), strict=True)):
+        scene = get_task(task).sample_scene(np.random.default_rng(seeds[i]))
+        world = get_task(task).make_world(scene)
+        for action in actions:
+            world.step(action)
         assert row["scene_seed"] == seeds[i]
+        assert (row["dropped"], row["touched"]) == (world.dropped, bool(world.touched))
+        assert row["success"] is get_task(task).is_success(world)
+        assert row["position_error"] == pytest.approx(world.position_error, abs=1e-5)
         # the mean over the last ten observations; the rollout holds all but the very last
         assert abs(row["position_error"] - distance[i, -9:].mean()) < 0.01
-        assert row["success"] == (not row["dropped"] and row["position_error"] < 0.05)
         assert row["localization_error"] > 0
 
 
-def test_both_protocols_on_their_own_scenes():
+@pytest.mark.parametrize("task", TASKS)
+def test_both_protocols_on_their_own_scenes(task):
     actor = make_actor()
-    result = evaluate(actor.world_model, actor.policy, "balance_reaching", test_episodes=3, paper_episodes=2)
-    test, paper = (set(result[name]["rows"]["scene_seed"]) for name in ("test", "paper"))
-    assert (len(test), len(paper), test & paper) == (3, 2, set())
-    assert result["test"]["summary"]["episodes"] == 3
+    result = evaluate(actor.world_model, actor.policy, task, test_episodes=3, paper_episodes=2)
+    first = [result[name]["rows"]["first_scene_seed"] for name in ("test", "paper")]
+    counts = [result[name]["summary"]["episodes"] for name in ("test", "paper")]
+    assert [len(result[name]["rows"]["success"]) for name in ("test", "paper")] == counts == [3, 2]
+    test, paper = (set(range(seed, seed + count)) for seed, count in zip(first, counts, strict=True))
     train = set(scene_seeds("train", 100_000)) | set(scene_seeds("eval", 100_000))
-    assert not (test | paper) & train
+    assert not test & paper and not (test | paper) & train

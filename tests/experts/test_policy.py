@@ -1,6 +1,7 @@
 """The shipped experts: complete, deterministic, and good at their task."""
 
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from dynmap_rl.experts.policy import CHECKPOINTS
 from dynmap_rl.runs import read_json
 
 TASK = "balance_reaching"
+RESULTS = Path(__file__).parents[2] / "recipes/results"
 LIMIT = (3.0, 3.0, 10.0)
 SHIPPED = sorted((path.parent.name, path.stem) for path in CHECKPOINTS.glob("*/*.safetensors"))
 
@@ -26,6 +28,15 @@ def test_last_checkpoint_succeeds_on_fresh_scenes(task):
     seeds = [scene_seed("exploration", 20_000_000 + i) for i in range(100)]
     worlds = roll_out(load_expert(task), get_task(task), seeds)
     assert sum(get_task(task).is_success(world) for world in worlds) >= 95
+
+
+@pytest.mark.parametrize(("task", "least"), [("balance_reaching_obstacle", 98), ("bin_dropping", 95)])
+def test_last_checkpoint_succeeded_on_the_test_scenes(task, least):
+    results = [read_json(path) for path in RESULTS.glob("expert_*.json")]
+    [result] = [result for result in results if result["task"] == result["expert"] == task]
+    assert result["checkpoint"] in (None, list_checkpoints(task)[-1])
+    assert (result["split"], result["episodes"]) == ("test", 1000)
+    assert result["rates"]["success"] >= least
 
 
 @pytest.mark.parametrize("task", TASKS)

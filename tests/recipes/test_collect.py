@@ -5,7 +5,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from dynmap_rl.data import load_dataset
+from dynmap_rl.envs.tasks import TASKS
 from recipes.collect import Config, main
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "collect.py"
@@ -16,15 +19,22 @@ def run(folder, *arguments):
     return subprocess.run(command, cwd=folder, env=os.environ, capture_output=True, text=True)
 
 
-def test_records_where_it_says_and_then_says_that_it_is_complete(tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ("kind", "task", "name"),
+    [("demonstrations", task, task) for task in TASKS]
+    + [("exploration", "balance_reaching", "balance_reaching_exploration")],
+)
+def test_records_where_it_says_and_then_says_that_it_is_complete(
+    tmp_path, monkeypatch, capsys, kind, task, name
+):
     monkeypatch.chdir(tmp_path)
-    config = Config(kind="exploration", episodes=1, eval_episodes=1, workers=1)
+    config = Config(task=task, kind=kind, episodes=1, eval_episodes=1, workers=1)
     main(config)
-    assert capsys.readouterr().out == "done: datasets/balance_reaching_exploration\n"
-    assert load_dataset("datasets/balance_reaching_exploration").shape == (2, 120)
-    assert [p.name for p in (tmp_path / "datasets").iterdir()] == ["balance_reaching_exploration"]
+    assert capsys.readouterr().out == f"done: datasets/{name}\n"
+    assert load_dataset(f"datasets/{name}").shape == (2, 120)
+    assert [p.name for p in (tmp_path / "datasets").iterdir()] == [name]
     main(config)
-    assert capsys.readouterr().out == "complete already: datasets/balance_reaching_exploration\n"
+    assert capsys.readouterr().out == f"complete already: datasets/{name}\n"
 
 
 def test_pushes_what_is_there_already(recording, monkeypatch, capsys):

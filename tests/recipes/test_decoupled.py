@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from dynmap_rl.envs.tasks import TASKS
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -78,7 +80,7 @@ def test_two_seeds_in_processes_on_a_world_model_that_is_there(smoke):
         ({"supervision": "jerk"}, "unknown supervision"),
         ({"policy": "transformer"}, "unknown policy"),
         ({"dataset": "no/where/here"}, "no dataset at no/where/here"),
-        ({"world_model": Path("nowhere")}, "holds no checkpoint"),
+        ({"world_model": Path("nowhere")}, "nowhere holds no finished run"),
         ({"task": "juggling"}, "unknown task"),
         ({"seeds": "0,0"}, "has one twice"),
         ({"seeds": "a"}, "whole numbers"),
@@ -94,15 +96,36 @@ def test_bad_input_is_refused_before_anything_is_written(recipe, tmp_path, setti
     assert not (tmp_path / "bad").exists()
 
 
-def test_a_world_model_of_another_row_is_refused(smoke, recipe, tmp_path):
+@pytest.mark.parametrize(
+    ("path", "settings", "message"),
+    [
+        (
+            "",
+            {"supervision": "none"},
+            r"is a world model of balance_reaching, decoupled, supervised on \('pos",
+        ),
+        ("world_model", {"task": "bin_dropping"}, "is a world model of balance_reaching, .* use recipes/gen"),
+        ("seed_0/policy", {}, "holds no finished run"),
+    ],
+)
+def test_a_world_model_of_another_row_is_refused(smoke, recipe, tmp_path, path, settings, message):
     folder, _ = smoke
-    trained = folder / "runs/decoupled/balance_reaching/position_velocity_recurrent_smoke"
-    for path, message in (
-        (trained / "world_model", "is supervised on"),
-        (trained / "seed_0/policy", "a policy"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            recipe.main(recipe.Config(smoke=True, supervision="none", world_model=path, run=tmp_path / "bad"))
+    trained = folder / "runs/decoupled/balance_reaching/position_velocity_recurrent_smoke" / path
+    with pytest.raises(ValueError, match=message):
+        recipe.main(recipe.Config(smoke=True, world_model=trained, run=tmp_path / "bad", **settings))
+    assert not (tmp_path / "bad").exists()
+
+
+@pytest.mark.parametrize("task", sorted({*TASKS} - {"balance_reaching"}))
+def test_smoke_run_of_another_task(recipe, recordings, tmp_path, capsys, task):
+    recipe.main(recipe.Config(smoke=True, task=task, dataset=str(recordings(task)), run=tmp_path))
+    evaluation = json.loads((tmp_path / "eval.json").read_text())
+    assert (evaluation["task"], evaluation["row"]) == (task, "RGB+[P+V]")
+    assert evaluation["world_model"] == {"task": task, "training": "decoupled"}
+    assert evaluation["trained_on"]["episodes"] == 4
+    printed = capsys.readouterr().out
+    assert f"RGB+[P+V], recurrent policy, {task}" in printed
+    assert "\n  paper  " not in printed, "its world models are of task 1"
 
 
 def test_an_unknown_option_gets_one_clear_line(tmp_path):

@@ -1,0 +1,87 @@
+"""The paper's three tables, built from the results alone: ours beside the paper's."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from dynmap_rl.runs import read_json
+
+from .paper import METRICS, TABLES, paper_numbers
+from .report import row_cells
+
+COLUMNS = {  # table: its columns, as (task, training, policy)
+    "I": [key for key in TABLES if key[0] == "balance_reaching"],
+    "II": [key for key in TABLES if key[0] == "balance_reaching_obstacle"],
+    "III": [key for key in TABLES if key[0] == "bin_dropping"],
+}
+ROWS = list(TABLES["bin_dropping", "joint", "recurrent"])  # in the paper's order, End-to-End first
+
+
+def read_cells(results: Path) -> dict[tuple, dict]:
+    """The results of a folder by ``(task, training, policy, row)``; those the paper has no cell for are left out."""
+    cells = {}
+    for path in sorted(results.glob("*.json")):
+        result = read_json(path)
+        if (
+            "world_model" not in result
+            or not paper_numbers(result)
+            or result["settings"].get("world_model_seed")
+        ):
+            continue
+        training = "decoupled" if result["world_model"]["training"] == "decoupled" else "joint"
+        cells[result["task"], training, result["policy"], result["row"]] = result
+    return cells
+
+
+def table_rows(results: Path) -> list[dict]:
+    """A dict for every cell: ``table``, ``row``, ``column``, by our protocol ``DR`` (%), ``PE`` (mm), ``SR`` (%), ``n``
+    episodes and the 95 % ``interval`` of SR; by the paper's ``protocol`` of 50 the mean and standard deviation of each;
+    the ``paper``'s own; ``seeds`` and ``command``."""
+    cells, rows = read_cells(results), []
+    for table, columns in COLUMNS.items():
+        for row in ROWS:
+            for column in columns:
+                if result := cells.get((*column, row)):
+                    test = result["test_protocol"]
+                    rows.append(
+                        {
+                            "table": table,
+                            "row": row,
+                            "column": ", ".join(column[1:]),
+                            **{name: test[name] for name in ("DR", "PE", "SR")},
+                            "n": test["episodes"],
+                            "interval": test["SR_interval"],
+                            "protocol": result["paper_protocol"],
+                            "paper": paper_numbers(result),
+                            "seeds": result["seeds"],
+                            "command": result["command"],
+                        }
+                    )
+    return rows
+
+
+def markdown_table(results: Path, table: str) -> str:
+    """One table: in every column the paper's numbers, ours by its protocol, and SR on the 1,000 shared starts."""
+    cells, columns = read_cells(results), COLUMNS[table]
+    metrics = [name for name in METRICS[columns[0][0]] if name != "SR"]
+    what = "SR (std)" + (f"; {', '.join(metrics)}" if metrics else "")
+    head = ["", *(f"{t}, {p}: paper, {what} | here, {what} | here, SR of 3,000" for _, t, p in columns)]
+    lines = [head, ["---"] * (1 + 3 * len(columns))]
+    for row in ROWS:
+        found = [cells.get((*column, row)) for column in columns]
+        if any(found):
+            lines.append(
+                [row, *(" | ".join(row_cells(result)) if result else "- | - | -" for result in found)]
+            )
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def print_tables(results: Path, form: str) -> None:
+    """Print all three as ``markdown`` or ``json``; ``ValueError`` for another form."""
+    if form == "json":
+        print(json.dumps(table_rows(results), indent=1))
+    elif form == "markdown":
+        print("\n\n".join(f"Table {table}\n\n{markdown_table(results, table)}" for table in COLUMNS))
+    else:
+        raise ValueError(f"--print is markdown or json, not {form!r}")

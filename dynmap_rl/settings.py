@@ -1,0 +1,56 @@
+"""What recipes check, and the dataset they find or record, before they train."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dynmap_rl import data, modules
+from dynmap_rl.envs.tasks import get_task
+from dynmap_rl.envs.world import EPISODE_STEPS
+from dynmap_rl.evaluation import SHARED_STARTS
+
+
+def check_settings(settings) -> list[int]:
+    """Refuse what cannot run, before anything is written.
+
+    Args:
+        settings: with ``task``, ``policy``, ``seeds``, ``dataset``, ``split``, ``test_episodes``, ``paper_episodes``
+            and, where there are any, ``updates``, ``policy_updates`` and ``window_steps``.
+
+    Returns:
+        The seeds of the policies.
+
+    Raises:
+        ValueError: a setting is wrong; the message says which.
+    """
+    get_task(settings.task)
+    modules.check_policy(settings.policy)
+    try:
+        seeds = [int(seed) for seed in settings.seeds.split(",")]
+    except ValueError as error:
+        raise ValueError(f"--seeds are whole numbers such as 0,1,2, not {settings.seeds!r}") from error
+    if len(set(seeds)) < len(seeds):
+        raise ValueError(f"--seeds {settings.seeds} has one twice")
+    if settings.split not in ("test", "validation"):
+        raise ValueError(f"--split is test or validation, not {settings.split!r}")
+    if settings.test_episodes > SHARED_STARTS:
+        raise ValueError(f"there are {SHARED_STARTS} shared start states, not {settings.test_episodes}")
+    for name in ("updates", "policy_updates", "test_episodes", "paper_episodes"):
+        if (value := getattr(settings, name, 1)) < 1:
+            raise ValueError(f"--{name} must be at least 1, not {value}")
+    if not 2 <= (steps := getattr(settings, "window_steps", 2)) <= EPISODE_STEPS:
+        raise ValueError(f"--window_steps must be 2 to {EPISODE_STEPS}, not {steps}")
+    if settings.dataset and (task := data.load_meta(settings.dataset)["task"]) != settings.task:
+        raise ValueError(f"{settings.dataset} holds the task {task}, not {settings.task}")
+    return seeds
+
+
+def find_or_record(settings) -> str | Path:
+    """The dataset of the settings, or ``datasets/TASK``, recorded if it is not there (six episodes for a smoke run)."""
+    if settings.dataset:
+        return settings.dataset
+    folder = Path("datasets") / get_task(settings.task).name
+    if settings.smoke:
+        folder = folder.with_name(f"{folder.name}_smoke")
+        return data.record_dataset(folder, settings.task, episodes=4, eval_episodes=2, workers=1)
+    return data.record_dataset(folder, settings.task)

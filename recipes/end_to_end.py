@@ -1,0 +1,79 @@
+"""End-to-end training (paper, Sec. III-B, Eq. 3): the policy's loss alone, through encoder and transition; evaluate.
+
+    python recipes/end_to_end.py
+    python recipes/end_to_end.py --policy feedforward
+
+Every seed has a world model of its own; recipes/generalize.py takes that of the first. With no option it records the
+demonstrations with the shipped expert first. The same command on the same run folder goes on where it was stopped, or
+says that it is done.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from dynmap_rl.runs import run_recipe
+
+
+@dataclass
+class Config:
+    # Name of the task: balance_reaching, balance_reaching_obstacle, bin_dropping, or module:Class of your own.
+    task: str = "balance_reaching"
+    # Policy: feedforward or recurrent.
+    policy: str = "recurrent"
+    # Seeds of world model and policy.
+    seeds: str = "0,1,2"
+    # Dataset: a folder or a hub id; by default datasets/TASK, recorded if it is not there.
+    dataset: str | None = None
+    # Run folder; by default runs/end_to_end/TASK/POLICY.
+    run: Path | None = None
+    # Optimiser steps, windows a step, steps a window, peak learning rate.
+    updates: int = 2500
+    windows: int = 8
+    window_steps: int = 48
+    learning_rate: float = 2e-3
+    # Weight of the steps in which the expert changes its action (see imitation_loss); 0 for the paper's plain L1.
+    emphasis: float = 60.0
+    # Bars painted on the background of a window, at most (see dynmap_rl.data.add_distractors); 0 for none.
+    distractors: int = 3
+    # Evaluation: scenes of the paper's protocol, shared start states, and the split they are of: test, or validation
+    # for choosing settings.
+    split: str = "test"
+    paper_episodes: int = 50
+    test_episodes: int = 1000
+    # Every stage in a minimal size, for tests.
+    smoke: bool = False
+
+
+SMOKE = {
+    "updates": 4, "windows": 2, "window_steps": 6, "paper_episodes": 2, "test_episodes": 3, "seeds": "0",
+}  # fmt: skip
+
+
+def main(config: Config) -> None:
+    from dynmap_rl import data, joint, modules, runs, settings
+    from dynmap_rl.envs.tasks import get_task
+    from dynmap_rl.evaluation import print_row, write_report
+
+    if config.smoke:
+        runs.replace_defaults(config, SMOKE)
+    seeds = settings.check_settings(config)
+    name = f"{config.policy}{'_smoke' if config.smoke else ''}"
+    folder = config.run or Path("runs/end_to_end") / get_task(config.task).name / name
+    folder = runs.open_run(folder, config, ignore=("run",))
+    if (folder / "eval.json").exists():
+        print(f"{folder} is done; delete it to run again")
+        return print_row(runs.read_json(folder / "eval.json"))
+
+    dataset = settings.find_or_record(config)
+    joint.train_seeds(dataset, (), folder, config, seeds, end_to_end=True)
+    world_model = modules.load_world_model(folder / f"seed_{seeds[0]}" / "world_model")
+    modules.save_world_model(folder / "world_model", world_model)
+    source = {"task": config.task, "training": "end_to_end"}
+    held_out = data.load_dataset(dataset, "eval")
+    result = write_report(folder, config, dataset, world_model, held_out, seeds, source=source)
+    print_row(result)
+    print(f"figures, rollouts and eval.json are in {folder}")
+
+
+if __name__ == "__main__":
+    run_recipe(main, Config)

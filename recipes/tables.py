@@ -1,0 +1,179 @@
+"""Run the whole grid of the paper's Tables I, II and III, cell by cell, and print the tables.
+
+    python recipes/tables.py --dry_run                  # the cells, what is done, the time that is left
+    python recipes/tables.py                            # all of them, one after the other
+    python recipes/tables.py --only balance_reaching_decoupled_position --workers 2
+    python recipes/tables.py --launcher ray             # the same cells on a Ray cluster (pip install dynmap_rl[ray])
+    python recipes/tables.py --print markdown           # or json: the tables from the results alone
+
+A cell is a run of another recipe; its result is a JSON in ``results``. World models are trained once and reused. A killed
+run loses at most what its cells in flight have not saved yet; the same command goes on.
+"""
+
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from dynmap_rl.runs import run_recipe
+
+RECIPES = Path(__file__).parent
+TASKS = "balance_reaching", "balance_reaching_obstacle", "bin_dropping"
+SUPERVISIONS = (
+    "none", "position", "velocity", "acceleration", "position,velocity", "position,acceleration",
+    "velocity,acceleration", "position,velocity,acceleration",
+)  # fmt: skip
+CLAIMS = "none", "position", "velocity", "position,velocity", "position,velocity,acceleration"
+MINUTES = {"decoupled": 12, "reuse": 5, "joint": 30, "end_to_end": 20, "generalize": 5}  # on two cores
+
+
+@dataclass
+class Config:
+    # Folder of the cells' results, and of their runs.
+    results: Path = RECIPES / "results"
+    runs: Path = Path("runs/tables")
+    # Only cells whose name holds this.
+    only: str = ""
+    # Cells at a time; each trains its policies in two processes.
+    workers: int = 1
+    # Where cells run: local, or ray (on the cluster that Ray finds, with this folder on every node).
+    launcher: str = "local"
+    # List the cells and stop.
+    dry_run: bool = False
+    # Print the tables as markdown or json and stop.
+    print: str | None = None
+    # Every cell in a minimal size, for tests.
+    smoke: bool = False
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A run of a recipe; ``needs`` names the cell whose world model it takes."""
+
+    name: str
+    recipe: str
+    arguments: tuple[str, ...]
+    needs: str | None = None
+
+    @property
+    def minutes(self) -> int:
+        return MINUTES["reuse" if self.recipe == "decoupled" and self.needs else self.recipe]
+
+
+def list_cells() -> list[Cell]:
+    """Those that train world models first."""
+    task, first, second = TASKS[0], [], []
+    for supervision in SUPERVISIONS:
+        row, given = supervision.replace(",", "_"), ("--supervision", supervision)
+        trained = f"{task}_decoupled_{row}_recurrent"
+        first.append(Cell(trained, "decoupled", given))
+        second.append(
+            Cell(
+                f"{task}_decoupled_{row}_feedforward",
+                "decoupled",
+                (*given, "--policy", "feedforward"),
+                trained,
+            )
+        )
+        first.append(Cell(f"{task}_joint_{row}_recurrent", "joint", given))
+    first += [
+        Cell(
+            f"{task}_decoupled_{s.replace(',', '_')}_recurrent_world_model_{seed}",
+            "decoupled",
+            ("--supervision", s, "--world_model_seed", str(seed)),
+        )
+        for s in CLAIMS
+        for seed in (1, 2)
+    ]
+    first.append(Cell(f"{task}_end_to_end_recurrent", "end_to_end", ()))
+    sources = [cell for cell in first if "world_model_" not in cell.name]
+    for other in TASKS[1:]:
+        second += [
+            Cell(cell.name.replace(task, other, 1), "generalize", ("--task", other), cell.name)
+            for cell in sources
+        ]
+    return first + second
+
+
+def run_cell(cell: Cell, config: Config) -> None:
+    """Run the recipe, which goes on where it was stopped, and keep its ``eval.json``.
+
+    Raises:
+        OSError: the recipe failed; the message is its own.
+    """
+    from dynmap_rl.runs import read_json, write_json
+
+    folder = config.runs / cell.name
+    command = [sys.executable, str(RECIPES / f"{cell.recipe}.py"), *cell.arguments, "--run", str(folder)]
+    if cell.needs:
+        command += ["--world_model", str(config.runs / cell.needs)]
+    command += ["--smoke"] if config.smoke else []
+    config.runs.mkdir(parents=True, exist_ok=True)
+    with open(config.runs / f"{cell.name}.log", "a") as log:
+        failed = subprocess.run(command, stdout=log, stderr=log).returncode
+    if failed:
+        raise OSError(f"{cell.name} failed; see {config.runs / cell.name}.log")
+    write_json(config.results / f"{cell.name}.json", read_json(folder / "eval.json"))
+
+
+def launch(cells: list[Cell], config: Config) -> list[str]:
+    """Run cells that do not depend on each other; the messages of those that failed."""
+
+    def attempt(cell: Cell) -> str | None:
+        try:
+            run_cell(cell, config)
+        except OSError as error:
+            return str(error)
+        print(f"done: {cell.name}", flush=True)
+        return None
+
+    if config.launcher == "ray":
+        try:
+            import ray
+        except ImportError as error:
+            raise ValueError("--launcher ray needs Ray: pip install 'dynmap_rl[ray]'") from error
+        ray.init(ignore_reinit_error=True)
+        remote = ray.remote(num_cpus=2, max_retries=0)(attempt)
+        return [message for message in ray.get([remote.remote(cell) for cell in cells]) if message]
+    with ThreadPoolExecutor(config.workers) as pool:
+        return [message for message in pool.map(attempt, cells) if message]
+
+
+def main(config: Config) -> None:
+    if config.launcher not in ("local", "ray"):
+        raise ValueError(f"--launcher is local or ray, not {config.launcher!r}")
+    if config.print:
+        from dynmap_rl.evaluation.tables import print_tables
+
+        return print_tables(config.results, config.print)
+    cells = [cell for cell in list_cells() if config.only in cell.name]
+    if not cells:
+        raise ValueError(f"no cell's name holds {config.only!r}; --dry_run lists them")
+    todo = [cell for cell in cells if not (config.results / f"{cell.name}.json").exists()]
+    if config.dry_run:
+        for cell in cells:
+            print(f"{f'{cell.minutes:3} min' if cell in todo else '   done'}  {cell.name}")
+        hours = sum(cell.minutes for cell in todo) / config.workers / 60
+        return print(
+            f"{len(cells) - len(todo)} of {len(cells)} cells are done; about {hours:.1f} hours are left"
+        )
+    if not config.smoke:
+        from dynmap_rl.data import record_dataset
+
+        for task in TASKS:  # here, so that cells do not record at the same time
+            if any(
+                task == dict(zip(c.arguments[::2], c.arguments[1::2], strict=True)).get("--task", TASKS[0])
+                for c in todo
+            ):
+                record_dataset(Path("datasets") / task, task)
+    failed = launch([cell for cell in todo if not cell.needs], config)
+    ready = [c for c in todo if c.needs and (config.runs / c.needs / "eval.json").exists()]
+    missing = [c.name for c in todo if c.needs and c not in ready]
+    failed += launch(ready, config) + [f"{name} waits for its world model" for name in missing]
+    if failed:
+        raise ValueError("; ".join(failed))
+
+
+if __name__ == "__main__":
+    run_recipe(main, Config)

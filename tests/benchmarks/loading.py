@@ -1,0 +1,51 @@
+"""Datasets: windows for training, and everything into memory."""
+
+from __future__ import annotations
+
+import torch
+from timing import compare, seconds
+
+from dynmap_rl import data
+
+WINDOWS, STEPS = 16, 24
+
+
+def _lerobot(dataset: str, **arguments):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    return LeRobotDataset("local/benchmark", root=dataset, **arguments)
+
+
+def window_sampling(dataset: str, batches: int = 5) -> dict:
+    """Windows a second, against a ``DataLoader`` with two workers over ``LeRobotDataset`` with delta timestamps."""
+    episodes = data.load_dataset(dataset, "train").select("pixels", "action", "goal", "dynamics")
+    generator = torch.Generator().manual_seed(0)
+    columns = ["observation.images.front", "action", "dynamics.position", "dynamics.velocity"]
+    times = [t / 20 for t in range(STEPS)]
+    dataset = _lerobot(dataset, delta_timestamps=dict.fromkeys(columns, times))
+    loader = torch.utils.data.DataLoader(dataset, WINDOWS, shuffle=True, num_workers=2)
+
+    def ours():
+        many = 20 * batches
+        time = seconds(
+            lambda: [data.sample_windows(episodes, WINDOWS, STEPS, generator) for _ in range(many)]
+        )
+        return many * WINDOWS / time
+
+    def theirs():
+        iterator = iter(loader)
+        next(iterator)  # the workers are up
+        return batches * WINDOWS / seconds(lambda: [next(iterator) for _ in range(batches)])
+
+    return compare(ours, theirs, repeats=3)
+
+
+def to_tensordict(dataset: str) -> dict:
+    """Frames a second into one TensorDict, against iterating ``LeRobotDataset``."""
+    frames = data.load_dataset(dataset).numel()
+    lerobot = _lerobot(dataset)
+
+    def theirs(count: int = 3000):
+        return count / seconds(lambda: [lerobot[i] for i in range(count)])
+
+    return compare(lambda: frames / seconds(lambda: data.load_dataset(dataset)), theirs, repeats=2)

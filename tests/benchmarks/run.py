@@ -1,0 +1,83 @@
+"""The speed table of the README: every row times two things in one run and gives their ratio.
+
+    uv run --group benchmarks python tests/benchmarks/run.py            # all rows
+    uv run --group benchmarks python tests/benchmarks/run.py batch ppo  # some of them
+
+Needs ``datasets/balance_reaching`` (``python recipes/collect.py``). Writes ``recipes/results/benchmarks.json``, where
+rows that were not asked for stay as they are.
+"""
+
+from __future__ import annotations
+
+import platform
+import sys
+from pathlib import Path
+
+import learning
+import loading
+import ppo
+import simulation
+
+from dynmap_rl.runs import read_json, write_json
+
+RESULTS = Path(__file__).parents[2] / "recipes" / "results" / "benchmarks.json"
+DATASET = "datasets/balance_reaching"
+US, MS = 1e6, 1e3
+
+# name: (what, against, unit, factor from seconds or rates to it, what the ratio should be, function)
+ROWS = {
+    "control_step": (
+        "control step, state", "bare loop of 50 x (set velocity, `space.step`)", "us", US, "<= 1.15", simulation.control_step
+    ),
+    "frame": ("control step with 64x64 frame", "the same without", "us", US, "<= 1.25", simulation.frame),
+    "pusht": ("frames/s with pixels", "gym-pusht `pixels`", "1/s", 1, ">= 10", simulation.pusht),
+    "batch": ("batched environment, a step of 64 worlds", "the worlds alone", "ms", MS, "<= 1.1", simulation.batch),
+    "processes": ("two processes of 64 worlds", "one", "steps/s", 1, ">= 1.8", simulation.processes),
+    "ppo": ("PPO, time to 97 % success", "Stable-Baselines3 on our Gymnasium id", "s", 1, "<= 0.33", ppo.ppo),
+    "training": (
+        "world-model training, frames/s", "the same in plain fp32, LSTM cells in a loop", "1/s", 1, ">= 6",
+        lambda: learning.world_model_training(DATASET),
+    ),
+    "training_decode_8": (
+        "the same", "the same, decoding as few frames as we do", "1/s", 1, "",
+        lambda: learning.world_model_training(DATASET, decode_all=False),
+    ),
+    "windows": (
+        "windows of 24 steps", "`DataLoader` over `LeRobotDataset`", "1/s", 1, ">= 100",
+        lambda: loading.window_sampling(DATASET),
+    ),
+    "to_tensordict": (
+        "dataset to TensorDict, frames/s", "iterating `LeRobotDataset`", "1/s", 1, ">= 10",
+        lambda: loading.to_tensordict(DATASET),
+    ),
+    "evaluation": (
+        "evaluation, an episode of 1,000", "one at a time through the Gymnasium id", "ms", MS, "<= 0.2",
+        lambda: learning.evaluation(DATASET),
+    ),
+}  # fmt: skip
+
+
+def markdown(results: dict) -> str:
+    lines = ["| what | against | ours | theirs | ratio | to reach |", "|---|---|---|---|---|---|"]
+    for name, (what, against, unit, factor, goal, _) in ROWS.items():
+        if row := results["rows"].get(name):
+            ours, theirs = (f"{row[key] * factor:.3g} {unit}" for key in ("ours", "theirs"))
+            lines.append(f"| {what} | {against} | {ours} | {theirs} | **{row['ratio']:.2f}** | {goal} |")
+    return "\n".join(lines)
+
+
+def main(names: list[str]) -> None:
+    if unknown := set(names) - set(ROWS):
+        sys.exit(f"unknown rows {sorted(unknown)}; choose from {list(ROWS)}")
+    results = read_json(RESULTS) if RESULTS.exists() else {"rows": {}}
+    for name in names or ROWS:
+        print(name, flush=True)
+        if row := ROWS[name][-1]():
+            results["rows"][name] = row
+            results["machine"] = platform.platform()
+            write_json(RESULTS, results)
+    print(markdown(results))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,179 @@
+"""The simulator: a control step, a frame, the batched environment, several processes."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import subprocess
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import torch
+from timing import compare, seconds
+from torchrl.envs.utils import step_mdp
+
+import dynmap_rl  # noqa: F401  (registers the ids)
+from dynmap_rl.envs import DynmapBatchedEnv, World, sample_scene
+from dynmap_rl.envs.renderer import Renderer
+from dynmap_rl.envs.tasks import get_task
+from dynmap_rl.envs.world import CONTROL_DT, EPISODE_STEPS, SUBSTEPS
+
+TASK = get_task("balance_reaching")
+
+
+def make_world(seed: int = 0) -> World:
+    return World(sample_scene(np.random.default_rng(seed)))
+
+
+def smooth_actions(seed: int = 0, steps: int = EPISODE_STEPS) -> np.ndarray:
+    """To and fro at a tenth of the limits, so that the block stays on the cart: contacts in every substep."""
+    phase = np.random.default_rng(seed).uniform(0, 2 * np.pi, 3)
+    time = np.arange(steps)[:, None] * CONTROL_DT
+    return 0.002 * np.sin(2 * time + phase) * np.sin(time)
+
+
+def control_step() -> dict:
+    """A control step against a bare Python loop of 50 x (set the cart's velocity, ``space.step``)."""
+    actions = smooth_actions()
+
+    def ours():
+        world = make_world()
+        return seconds(lambda: [world.step(action) for action in actions]) / len(actions)
+
+    def bare():
+        world = make_world()
+        cart, step, dt = world.cart, world.space.step, CONTROL_DT / SUBSTEPS
+        velocities = (actions / CONTROL_DT).tolist()
+
+        def run():
+            for x, y, _ in velocities:
+                for _ in range(SUBSTEPS):
+                    cart.velocity = (x, y)
+                    step(dt)
+
+        return seconds(run) / len(actions)
+
+    return compare(ours, bare, repeats=25)
+
+
+def frame() -> dict:
+    """A control step with a 64 x 64 frame against one without."""
+    actions, renderer = smooth_actions(), Renderer()
+
+    def with_frame():
+        world = make_world()
+
+        def run():
+            for action in actions:
+                world.step(action)
+                renderer.draw(world, TASK)
+
+        return seconds(run) / len(actions)
+
+    def without():
+        world = make_world()
+        return seconds(lambda: [world.step(action) for action in actions]) / len(actions)
+
+    return compare(with_frame, without, repeats=25)
+
+
+def pusht() -> dict | None:
+    """Frames a second through the Gymnasium id with ``pixels``, against gym-pusht's, both at 64 x 64.
+
+    gym-pusht needs PyMunk 6 and so an environment of its own: the variable ``PUSHT_PYTHON`` names its interpreter.
+    """
+    if "PUSHT_PYTHON" not in os.environ:
+        return None
+    env = gym.make("dynmap_rl/BalanceReaching-v0", obs_type="pixels")
+    actions = smooth_actions().astype(np.float32)
+
+    def ours():
+        env.reset(seed=0)
+        return len(actions) / seconds(lambda: [env.step(action) for action in actions])
+
+    def theirs():
+        script = Path(__file__).with_name("pusht.py")
+        return float(subprocess.check_output([os.environ["PUSHT_PYTHON"], script], stderr=subprocess.DEVNULL))
+
+    return compare(ours, theirs, repeats=5)
+
+
+def batch(num_envs: int = 64, steps: int = 60) -> dict:
+    """The batched TorchRL environment against its worlds alone, a control step of all of them."""
+    actions = np.stack([smooth_actions(i, steps) for i in range(num_envs)], 1).astype(np.float32)
+
+    def ours():
+        env = DynmapBatchedEnv(num_envs=num_envs, seed=0)
+        td, tensors = env.reset(), torch.from_numpy(actions)
+
+        def run():
+            state = td
+            for action in tensors:
+                state = step_mdp(env.step(state.set("action", action)))
+
+        return seconds(run) / steps
+
+    def worlds_alone():
+        worlds = [make_world(i) for i in range(num_envs)]
+
+        def run():
+            for step in actions:
+                for world, action in zip(worlds, step, strict=True):
+                    world.step(action)
+
+        return seconds(run) / steps
+
+    return compare(ours, worlds_alone)
+
+
+def processes() -> dict:
+    """Control steps a second in two processes of 64 worlds, against one; ``limit`` is the same for plain arithmetic,
+    which shares nothing: what this machine's second core gives."""
+    result = compare(lambda: _rate(_step_worlds, 2), lambda: _rate(_step_worlds, 1), repeats=3)
+    return result | {"limit": compare(lambda: _rate(_count, 2), lambda: _rate(_count, 1), repeats=3)["ratio"]}
+
+
+def _rate(work, count: int) -> float:
+    context = multiprocessing.get_context("spawn")
+    barrier, queue = context.Barrier(count), context.Queue()
+    workers = [context.Process(target=_timed, args=(work, barrier, queue)) for _ in range(count)]
+    for worker in workers:
+        worker.start()
+    rates = [queue.get() for _ in workers]
+    for worker in workers:
+        worker.join()
+    return sum(rates)
+
+
+def _timed(work, barrier, queue) -> None:
+    torch.set_num_threads(1)
+    run, amount = work()
+    barrier.wait()
+    queue.put(amount / seconds(run))
+
+
+def _step_worlds(num_envs: int = 64, steps: int = 400):
+    env = DynmapBatchedEnv(num_envs=num_envs, seed=0)
+    td = env.reset()
+    actions = torch.from_numpy(np.stack([smooth_actions(i, steps) for i in range(num_envs)], 1)).float()
+
+    def run():
+        state = td
+        for action in actions:
+            state = step_mdp(env.step(state.set("action", action)))
+
+    return run, num_envs * steps
+
+
+def _count(amount: int = 20_000_000):
+    return lambda: sum(range(amount)), amount
+
+
+def scaling(sizes=(6, 60, 600), steps: int = 30) -> dict[str, dict]:
+    """Seconds for so many worlds in one batch."""
+    times = {}
+    for size in sizes:
+        env = DynmapBatchedEnv(num_envs=size, seed=0)
+        times[str(size)] = seconds(lambda env=env: env.rollout(steps, break_when_any_done=False))
+    return times

@@ -1,0 +1,28 @@
+"""Two things timed in turn, in one run: the machine's mood is then in both."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+
+
+def compare(ours: Callable[[], float], theirs: Callable[[], float], repeats: int = 9) -> dict[str, float]:
+    """Medians of what two functions return, and the median of ours / theirs over the pairs.
+
+    Args:
+        ours, theirs: each does its work and returns a number, seconds or a rate.
+    """
+    ours(), theirs()  # warm
+    pairs = [(ours(), theirs()) for _ in range(repeats)]
+    return {
+        "ours": statistics.median(a for a, _ in pairs),
+        "theirs": statistics.median(b for _, b in pairs),
+        "ratio": statistics.median(a / b for a, b in pairs),
+    }
+
+
+def seconds(work: Callable[[], object]) -> float:
+    began = time.perf_counter()
+    work()
+    return time.perf_counter() - began

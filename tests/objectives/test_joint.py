@@ -1,0 +1,93 @@
+"""Joint and end-to-end losses: which terms there are, and which weights each moves (paper, Eq. 3 and 4)."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from dynmap_rl.modules import make_policy, make_world_model
+from dynmap_rl.objectives import JointLoss, WorldModelLoss, imitation_loss
+
+CONSTANTS = {
+    "action": {"low": [-0.02, -0.02, -0.05], "high": [0.02, 0.02, 0.05]},
+    "goal": {"low": [0.0, 0.0], "high": [1.0, 1.0]},
+    "position": {"low": [-2.0] * 6, "high": [2.0] * 6},
+}
+
+
+@pytest.fixture
+def td():
+    generator = torch.Generator().manual_seed(0)
+    b, t = 2, 5
+    return TensorDict(
+        {
+            "pixels": torch.randint(0, 256, (b, t, 3, 64, 64), dtype=torch.uint8, generator=generator),
+            "action": 0.02 * torch.randn(b, t, 3, generator=generator),
+            "goal": torch.rand(b, t, 2, generator=generator),
+            "dynamics": {"position": torch.rand(b, t, 6, generator=generator)},
+        },
+        [b, t],
+    )
+
+
+def make(kind="recurrent", **arguments):
+    torch.manual_seed(0)
+    model = make_world_model(CONSTANTS, ("position",), latent_size=16, hidden_size=24)
+    policy = make_policy(CONSTANTS, kind, model, width=16)
+    return JointLoss(WorldModelLoss(model), policy, **arguments), model, policy
+
+
+def moved(module: torch.nn.Module) -> bool:
+    return any(p.grad is not None and bool(p.grad.any()) for p in module.parameters())
+
+
+@pytest.mark.parametrize("kind", ["feedforward", "recurrent"])
+def test_end_to_end_moves_encoder_transition_and_policy_by_the_policy_s_loss_alone(td, kind):
+    loss, model, policy = make(kind, end_to_end=True)
+    losses = loss(td)
+    assert list(losses.keys()) == ["loss_policy"]
+    losses["loss_policy"].backward()
+    assert moved(model.encoder) and moved(model.transition.lstm) and moved(policy)
+    assert not moved(model.image_decoder) and not moved(model.dynamics_decoder)
+
+
+def test_joint_is_the_world_model_s_loss_and_the_weighted_policy_s(td):
+    loss, model, policy = make(beta_joint=3.0)
+    losses = loss(td)
+    for name, value in WorldModelLoss(model)(td).items():
+        torch.testing.assert_close(losses[name], value)
+    latent = model.encode(td["pixels"])
+    _, hidden1, hidden2 = model.predict(latent, td["action"])
+    predicted = policy(latent, hidden1, hidden2, td["goal"])
+    expected = 3 * imitation_loss(predicted, td["action"], policy.action)
+    torch.testing.assert_close(losses["loss_policy"], expected)
+    sum(losses.values()).backward()
+    assert all(map(moved, (model.encoder, model.image_decoder, model.dynamics_decoder, policy)))
+
+
+def test_without_weight_the_world_model_learns_as_alone(td):
+    loss, model, _ = make(beta_joint=0.0)
+    sum(loss(td).values()).backward()
+    joint = [p.grad.clone() for p in model.parameters()]
+    model.zero_grad()
+    sum(WorldModelLoss(model)(td).values()).backward()
+    for a, b in zip(joint, (p.grad for p in model.parameters()), strict=True):
+        torch.testing.assert_close(a, b)
+
+
+def test_disturbed_steps_do_not_count_for_the_policy(td):
+    loss, *_ = make(end_to_end=True)
+    td["disturbed"] = torch.zeros(2, 5, 1, dtype=torch.bool)
+    plain = loss(td)["loss_policy"].item()
+    td["disturbed"][:, -1] = True  # the last action is seen by no later state
+    ignored = loss(td)["loss_policy"].item()
+    td["action"][:, -1] += 1.0
+    assert ignored != plain
+    assert loss(td)["loss_policy"].item() == pytest.approx(ignored)
+
+
+def test_keys_can_be_set(td):
+    loss, *_ = make(end_to_end=True)
+    expected = loss(td)["loss_policy"]
+    td.rename_key_("goal", ("target", "place"))
+    loss.set_keys(goal=("target", "place"))
+    torch.testing.assert_close(loss(td)["loss_policy"], expected)

@@ -1,0 +1,63 @@
+"""Joint and end-to-end training as commands."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from dynmap_rl.runs import read_json
+
+RECIPES = Path(__file__).parents[2] / "recipes"
+
+
+def run(folder, recipe, *arguments):
+    command = [sys.executable, str(RECIPES / f"{recipe}.py"), *arguments]
+    return subprocess.run(command, cwd=folder, env=os.environ, capture_output=True, text=True)
+
+
+@pytest.mark.parametrize(
+    ("recipe", "name", "row", "paper"),
+    [
+        (
+            "joint",
+            "position_velocity_recurrent",
+            "RGB+[P+V]",
+            "DR 9 (1.9) %   PE 54 (11.0) mm   SR 59 (9.6) %",
+        ),
+        ("end_to_end", "recurrent", "End-to-End", "DR 19 (9.0) %   PE 71 (21.9) mm   SR 57 (10.6) %"),
+    ],
+)
+def test_smoke_run_and_its_world_model_taken_to_task_3(recording, tmp_path, recipe, name, row, paper):
+    arguments = "--smoke", "--seeds", "0,1", "--dataset", str(recording)
+    result = run(tmp_path, recipe, *arguments)
+    assert result.returncode == 0, result.stderr
+    assert paper in result.stdout
+    folder = tmp_path / "runs" / recipe / "balance_reaching" / f"{name}_smoke"
+    evaluation = read_json(folder / "eval.json")
+    assert evaluation["row"] == row
+    assert evaluation["world_model"] == {"task": "balance_reaching", "training": recipe}
+    shas = [seed["world_model_sha256"] for seed in evaluation["results"]]
+    assert shas[0] != shas[1], "every seed has a world model of its own"
+    assert (folder / "rollouts.gif").stat().st_size > 1000
+    assert "is done" in run(tmp_path, recipe, *arguments).stdout
+
+    frozen = run(tmp_path, "generalize", "--smoke", "--task", "bin_dropping", "--world_model", str(folder))
+    assert frozen.returncode == 0, frozen.stderr
+    taken = tmp_path / f"runs/generalize/bin_dropping/{recipe}"
+    [taken] = taken.parent.glob(f"{recipe}_*")
+    assert read_json(taken / "eval.json")["world_model_sha256"] == shas[0]
+    assert read_json(taken / "eval.json")["row"] == row
+
+
+@pytest.mark.parametrize("recipe", ["joint", "end_to_end"])
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [(["--updates", "0"], "--updates must be at least 1"), (["--policy", "transformer"], "unknown policy")],
+)
+def test_bad_input_is_refused_before_anything_is_written(tmp_path, recipe, arguments, message):
+    result = run(tmp_path, recipe, *arguments)
+    assert result.returncode == 2
+    assert message in result.stderr and "Traceback" not in result.stderr
+    assert not any(tmp_path.iterdir())

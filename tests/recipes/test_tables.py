@@ -1,0 +1,101 @@
+"""The grid of the paper's tables: its cells, its runs, and what is printed of its results."""
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from dynmap_rl.evaluation.paper import TABLES, parse_supervision, row_name
+
+RECIPE = Path(__file__).parents[2] / "recipes" / "tables.py"
+
+
+def run(folder, *arguments):
+    command = [sys.executable, str(RECIPE), "--results", "results", *arguments]
+    return subprocess.run(command, cwd=folder, env=os.environ, capture_output=True, text=True)
+
+
+@pytest.fixture(scope="module")
+def recipe():
+    spec = importlib.util.spec_from_file_location("tables_recipe", RECIPE)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["tables_recipe"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_there_is_a_cell_for_every_one_of_the_paper(recipe):
+    cells = recipe.list_cells()
+    assert len({cell.name for cell in cells}) == len(cells)
+    by_name = {cell.name: cell for cell in cells}
+    expected = {(*column, row) for column, rows in TABLES.items() for row in rows}
+    found = set()
+    for cell in cells:
+        if "world_model_" in cell.name:
+            continue
+        source = by_name[cell.needs] if cell.needs else cell
+        options = dict(zip(source.arguments[::2], source.arguments[1::2], strict=True))
+        supervision = parse_supervision(options.get("--supervision", "none"))
+        own = dict(zip(cell.arguments[::2], cell.arguments[1::2], strict=True))
+        training = "decoupled" if source.recipe == "decoupled" else "joint"
+        row = row_name(supervision, source.recipe)
+        task = own.get("--task", "balance_reaching")
+        found.add((task, training, own.get("--policy", "recurrent"), row))
+    assert found == expected
+
+
+def test_cells_run_once_and_are_printed_beside_the_paper(tmp_path):
+    smoke = "--smoke", "--only", "joint_none"
+    result = run(tmp_path, *smoke)
+    assert result.returncode == 0, result.stderr
+    names = [
+        f"{task}_joint_none_recurrent"
+        for task in ("balance_reaching", "balance_reaching_obstacle", "bin_dropping")
+    ]
+    assert [line.removeprefix("done: ") for line in result.stdout.splitlines()] == names
+    assert sorted(p.stem for p in (tmp_path / "results").iterdir()) == sorted(names)
+
+    times = {path: path.stat().st_mtime_ns for path in (tmp_path / "results").iterdir()}
+    (tmp_path / "results/bin_dropping_joint_none_recurrent.json").unlink()
+    again = run(tmp_path, *smoke)
+    assert again.stdout == "done: bin_dropping_joint_none_recurrent\n"
+    assert all(path.stat().st_mtime_ns == time for path, time in times.items() if "bin" not in path.name)
+
+    rows = json.loads(run(tmp_path, "--print", "json").stdout)
+    assert [(r["table"], r["row"], r["column"], r["n"]) for r in rows] == [
+        (table, "Only-RGB", "joint, recurrent", 3) for table in ("I", "II", "III")
+    ]
+    assert rows[2]["paper"]["SR"] == [46, 1.6]
+    text = run(tmp_path, "--print", "markdown").stdout
+    assert "| Only-RGB | - | - | - | - | - | - | 64 (5.9); 17, 92 |" in text
+    dry = run(tmp_path, "--dry_run").stdout
+    assert dry.count("   done  ") == 3 and "3 of 69 cells are done" in dry
+
+
+def test_a_cell_that_fails_says_where_to_look_and_the_others_go_on(tmp_path):
+    (tmp_path / "runs/tables/balance_reaching_joint_none_recurrent").mkdir(parents=True)
+    (tmp_path / "runs/tables/balance_reaching_joint_none_recurrent/config.json").write_text("{}")
+    result = run(tmp_path, "--smoke", "--only", "joint_none")
+    assert result.returncode == 2
+    assert "balance_reaching_joint_none_recurrent failed; see runs/tables/" in result.stderr
+    assert "bin_dropping_joint_none_recurrent waits for its world model" in result.stderr
+    log = tmp_path / "runs/tables/balance_reaching_joint_none_recurrent.log"
+    assert "holds a run with other settings" in log.read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--only", "nothing"], "no cell's name holds"),
+        (["--launcher", "slurm"], "local or ray"),
+        (["--print", "html"], "markdown or json"),
+    ],
+)
+def test_bad_input_gets_one_clear_line(tmp_path, arguments, message):
+    result = run(tmp_path, *arguments)
+    assert result.returncode == 2
+    assert message in result.stderr and "Traceback" not in result.stderr
