@@ -50,7 +50,7 @@ def train_policies(
         constants: of the dataset's normalisation.
         folder: run folder; gets ``world_model`` and ``seed_N`` with ``policy``, ``metrics.jsonl``, ``eval.json``.
         settings: of the policy's training (see :func:`dynmap_rl.training.train_policy`) and evaluation, with
-            ``copies``.
+            ``copies`` and ``device``.
         seeds: of the policies.
 
     Returns:
@@ -65,10 +65,12 @@ def train_policies(
     modules.save_world_model(folder / "world_model", world_model)
     todo = [seed for seed in seeds if not (folder / f"seed_{seed}" / "eval.json").exists()]
     if todo:
-        generator = torch.Generator().manual_seed(0)
+        device = runs.choose_device(settings.device)
+        world_model.to(device)
+        generator = torch.Generator(device).manual_seed(0)
         features = data.compute_features(world_model, episodes["train"], settings.copies, generator)
-        features.memmap(folder / "features" / "train")
-        data.compute_features(world_model, episodes["eval"]).memmap(folder / "features" / "eval")
+        features.cpu().memmap(folder / "features" / "train")
+        data.compute_features(world_model, episodes["eval"]).cpu().memmap(folder / "features" / "eval")
         runs.run_processes(
             _train_and_evaluate, [(settings, folder, constants, seed, frozen) for seed in todo]
         )
@@ -83,8 +85,9 @@ def _train_and_evaluate(arguments: tuple) -> None:
     settings, folder, constants, seed, frozen = arguments
     torch.set_num_threads(1)
     runs.seed_everything(1000 + seed)
-    world_model = modules.load_world_model(folder / "world_model").requires_grad_(False)
-    policy = modules.make_policy(constants, settings.policy, world_model)
+    device = runs.choose_device(settings.device)
+    world_model = modules.load_world_model(folder / "world_model").requires_grad_(False).to(device)
+    policy = modules.make_policy(constants, settings.policy, world_model).to(device)
     features = TensorDict.load_memmap(folder / "features" / "train")
     held_out = TensorDict.load_memmap(folder / "features" / "eval")
     train_policy(policy, features, held_out, folder / f"seed_{seed}", settings, seed)

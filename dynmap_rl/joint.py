@@ -25,7 +25,7 @@ def train_seeds(
         dataset: a folder or a hub id.
         supervision: of the world model.
         folder: run folder; gets ``seed_N`` with ``world_model``, ``policy``, ``metrics.jsonl``, ``eval.json``.
-        settings: see :func:`dynmap_rl.training.train_jointly`; also with ``policy``, ``split``,
+        settings: see :func:`dynmap_rl.training.train_jointly`; also with ``policy``, ``device``, ``split``,
             ``test_episodes`` and ``paper_episodes``.
         seeds: of world model and policy.
         end_to_end: minimise the policy's loss alone.
@@ -44,8 +44,9 @@ def _train_and_evaluate(arguments: tuple) -> None:
     torch.set_num_threads(1)
     runs.seed_everything(2000 + seed)
     constants = data.load_meta(dataset)["normalization"]
-    world_model = modules.make_world_model(constants, supervision)
-    policy = modules.make_policy(constants, settings.policy, world_model)
+    device = runs.choose_device(settings.device)
+    world_model = modules.make_world_model(constants, supervision).to(device)
+    policy = modules.make_policy(constants, settings.policy, world_model).to(device)
     episodes = {split: data.load_dataset(dataset, split) for split in ("train", "eval")}
     folder = folder / f"seed_{seed}"
     train_jointly(world_model, policy, episodes, folder, settings, seed, end_to_end)

@@ -174,6 +174,24 @@ def load_weights(path: Path, module: torch.nn.Module) -> None:
         raise ValueError(f"{path} does not hold this model's weights: {error}") from error
 
 
+def choose_device(name: str) -> torch.device:
+    """The device of a name; ``auto`` is the GPU where there is one.
+
+    Raises:
+        ValueError: there is no such device here.
+    """
+    import torch
+
+    gpu = torch.cuda.is_available()
+    if name not in ("auto", "cpu", "cuda"):
+        raise ValueError(f"--device is auto, cpu or cuda, not {name!r}")
+    if name == "cuda" and not gpu:
+        raise ValueError(
+            "--device cuda: PyTorch finds no GPU here; leave it out, or install a CUDA build of PyTorch"
+        )
+    return torch.device("cuda" if gpu and name != "cpu" else "cpu")
+
+
 def seed_everything(seed: int) -> None:
     """Seed Python, NumPy and torch."""
     import torch

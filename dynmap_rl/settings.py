@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dynmap_rl import data, modules
+from dynmap_rl import data, modules, runs
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.world import EPISODE_STEPS
 from dynmap_rl.evaluation import SHARED_STARTS
@@ -14,7 +14,7 @@ def check_settings(settings) -> list[int]:
     """Refuse what cannot run, before anything is written.
 
     Args:
-        settings: with ``task``, ``policy``, ``seeds``, ``dataset``, ``split``, ``test_episodes``, ``paper_episodes``
+        settings: with ``task``, ``device``, ``policy``, ``seeds``, ``dataset``, ``split``, ``test_episodes``, ``paper_episodes``
             and, where there are any, ``updates``, ``policy_updates`` and ``window_steps``.
 
     Returns:
@@ -24,6 +24,7 @@ def check_settings(settings) -> list[int]:
         ValueError: a setting is wrong; the message says which.
     """
     get_task(settings.task)
+    runs.choose_device(settings.device)
     modules.check_policy(settings.policy)
     try:
         seeds = [int(seed) for seed in settings.seeds.split(",")]

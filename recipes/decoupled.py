@@ -57,6 +57,8 @@ class Config:
     test_episodes: int = 1000
     # Every stage in a minimal size, for tests.
     smoke: bool = False
+    # cpu, cuda, or auto: the GPU where there is one.
+    device: str = "auto"
     threads: int = 2
 
 
@@ -88,7 +90,7 @@ def main(config: Config) -> None:
             )
     name = f"{'_'.join(supervision) or 'none'}_{config.policy}{'_smoke' if config.smoke else ''}"
     folder = config.run or Path("runs/decoupled") / get_task(config.task).name / name
-    folder = runs.open_run(folder, config, ignore=("run", "threads"))
+    folder = runs.open_run(folder, config, ignore=("run", "threads", "device"))
     if (folder / "eval.json").exists():
         print(f"{folder} is done; delete it to run again")
         return print_row(runs.read_json(folder / "eval.json"))
@@ -102,6 +104,7 @@ def main(config: Config) -> None:
     if world_model is None:
         runs.seed_everything(config.world_model_seed)
         world_model = modules.make_world_model(constants, supervision, keypoints=config.keypoints)
+        world_model.to(runs.choose_device(config.device))
         train_world_model(world_model, episodes, folder, config)
     fingerprint = frozen.train_policies(world_model, episodes, constants, folder, config, seeds)
     result = write_report(folder, config, dataset, world_model, episodes["eval"], seeds, fingerprint)

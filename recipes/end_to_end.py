@@ -42,6 +42,8 @@ class Config:
     test_episodes: int = 1000
     # Every stage in a minimal size, for tests.
     smoke: bool = False
+    # cpu, cuda, or auto: the GPU where there is one.
+    device: str = "auto"
 
 
 SMOKE = {
@@ -59,7 +61,7 @@ def main(config: Config) -> None:
     seeds = settings.check_settings(config)
     name = f"{config.policy}{'_smoke' if config.smoke else ''}"
     folder = config.run or Path("runs/end_to_end") / get_task(config.task).name / name
-    folder = runs.open_run(folder, config, ignore=("run",))
+    folder = runs.open_run(folder, config, ignore=("run", "device"))
     if (folder / "eval.json").exists():
         print(f"{folder} is done; delete it to run again")
         return print_row(runs.read_json(folder / "eval.json"))

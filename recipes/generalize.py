@@ -42,6 +42,8 @@ class Config:
     test_episodes: int = 1000
     # Every stage in a minimal size, for tests.
     smoke: bool = False
+    # cpu, cuda, or auto: the GPU where there is one.
+    device: str = "auto"
     threads: int = 2
 
 
@@ -67,7 +69,7 @@ def main(config: Config) -> None:
     name = f"{source['training']}_{'_'.join(world_model.supervision) or 'none'}_{config.policy}"
     name += "_smoke" if config.smoke else ""
     folder = config.run or Path("runs/generalize") / get_task(config.task).name / name
-    folder = runs.open_run(folder, config, ignore=("run", "threads"))
+    folder = runs.open_run(folder, config, ignore=("run", "threads", "device"))
     if (folder / "eval.json").exists():
         result = runs.read_json(folder / "eval.json")
         if result["world_model_sha256"] != fingerprint(world_model):

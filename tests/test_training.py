@@ -29,6 +29,7 @@ SETTINGS = SimpleNamespace(
     policy_batch=2,
     policy_learning_rate=1e-3,
     emphasis=30.0,
+    device="cpu",
 )
 
 

@@ -6,7 +6,6 @@ import torch
 from tensordict import TensorDictBase
 
 METERS_PER_PIXEL = 1 / 64
-MIRROR = torch.tensor([-1.0, 1.0, -1.0])  # x, y, theta under a reflection of x
 
 
 def sample_windows(
@@ -14,16 +13,18 @@ def sample_windows(
 ) -> TensorDictBase:
     """Random windows ``[batch, length]`` of episodes ``[E, T]``; every other one begins at t = 0.
 
+    The generator is on the device of the episodes, here as in all that follows.
+
     Raises:
         ValueError: the episodes are shorter than ``length``.
     """
     count, steps = episodes.shape
     if steps < length:
         raise ValueError(f"windows of {length} steps do not fit into episodes of {steps}")
-    episode = torch.randint(count, (batch, 1), generator=generator)
-    start = torch.randint(steps - length + 1, (batch, 1), generator=generator)
+    episode = _integers(0, count, (batch, 1), generator)
+    start = _integers(0, steps - length + 1, (batch, 1), generator)
     start[::2] = 0  # where the model's memory begins in control, and where most of the motion is
-    return episodes[episode, start + torch.arange(length)]
+    return episodes[episode, start + torch.arange(length, device=generator.device)]
 
 
 def augment(
@@ -36,12 +37,14 @@ def augment(
     dynamics, action and goal follow; ``agent_pos`` and ``state`` are left out.
     """
     batch = windows.shape[0]
-    mirrored = (torch.rand(batch, generator=generator) < 0.5) & mirror
-    shift = torch.randint(-max_shift, max_shift + 1, (batch, 2), generator=generator)
-    channels = torch.stack([torch.randperm(3, generator=generator) for _ in range(batch)])
+    mirrored = _integers(0, 2, (batch,), generator).bool() & mirror
+    shift = _integers(-max_shift, max_shift + 1, (batch, 2), generator)
+    channels = _orders(batch, generator)
 
-    sign = torch.where(mirrored[:, None, None], MIRROR, torch.ones(3))  # (B, 1, 3)
-    offset = torch.zeros(batch, 1, 3)
+    sign = torch.ones(batch, 1, 3, device=generator.device)
+    sign[:, 0, 0] -= 2.0 * mirrored  # x and theta change their signs under a reflection of x
+    sign[:, 0, 2] -= 2.0 * mirrored
+    offset = torch.zeros(batch, 1, 3, device=generator.device)
     offset[:, 0, :2] = shift * METERS_PER_PIXEL
     offset[:, 0, 0] += mirrored  # 1 - x
     windows = windows.exclude("agent_pos", "state")  # they hold poses that are not changed with the rest
@@ -76,14 +79,14 @@ def _draw_bars(batch: int, most: int, size: int, generator: torch.Generator) -> 
     rows = _span(torch.where(upright, long, thick), size, generator)[..., None]
     columns = _span(torch.where(upright, thick, long), size, generator)[..., None, :]
     count = _integers(0, most + 1, (batch, 1), generator)
-    chosen = (torch.arange(most) < count)[..., None, None]
+    chosen = (torch.arange(most, device=generator.device) < count)[..., None, None]
     return (rows & columns & chosen).any(1)
 
 
 def _span(lengths: torch.Tensor, size: int, generator: torch.Generator) -> torch.Tensor:
     """Masks ``[..., size]`` of so many pixels from a random one on."""
     start = _integers(0, size, lengths.shape, generator).unsqueeze(-1)
-    grid = torch.arange(size)
+    grid = torch.arange(size, device=generator.device)
     return (grid >= start) & (grid < start + lengths.unsqueeze(-1))
 
 
@@ -91,18 +94,22 @@ def _draw_colors(batch: int, generator: torch.Generator) -> torch.Tensor:
     """Vivid, as markers are: one channel at 180 or more, one at 80 or less, uint8 ``[B, 3]``."""
     shape = batch, 1
     values = [_integers(low, high, shape, generator) for low, high in ((180, 256), (0, 256), (0, 81))]
-    order = torch.rand(batch, 3, generator=generator).argsort(1)
-    return torch.cat(values, 1).gather(1, order).to(torch.uint8)
+    return torch.cat(values, 1).gather(1, _orders(batch, generator)).to(torch.uint8)
+
+
+def _orders(batch: int, generator: torch.Generator) -> torch.Tensor:
+    """Permutations of three, ``[B, 3]``."""
+    return torch.rand(batch, 3, generator=generator, device=generator.device).argsort(1)
 
 
 def _integers(low: int, high: int, shape, generator: torch.Generator) -> torch.Tensor:
-    return torch.randint(low, high, shape, generator=generator)
+    return torch.randint(low, high, shape, generator=generator, device=generator.device)
 
 
 def _transform_pixels(pixels, mirror, shift, channels) -> torch.Tensor:
     # For every output pixel the row, column and channel that it comes from; rows point down, y up.
     size = pixels.shape[-1]
-    grid = torch.arange(size)
+    grid = torch.arange(size, device=pixels.device)
     columns = (grid - shift[:, :1]).clamp(0, size - 1)  # (B, W)
     columns = torch.where(mirror[:, None], size - 1 - columns, columns)
     rows = (grid + shift[:, 1:]).clamp(0, size - 1)

@@ -22,7 +22,7 @@ def compute_features(
     """Latents and hidden states of whole episodes, with the actions and goals that go with them.
 
     Args:
-        world_model: frozen.
+        world_model: frozen; the result is on its device.
         episodes: ``[E, T]`` with ``pixels``, ``action``, ``goal``, ``dynamics``.
         copies: so many recoloured versions of every episode follow the plain ones, each from a random step on.
         generator: of the copies.
@@ -31,11 +31,13 @@ def compute_features(
         ``[(1 + copies) E, T]`` with ``latent``, ``hidden1``, ``hidden2``, ``action``, ``goal`` and ``disturbed``: the
         steps that are no demonstration, by a push or beyond the end.
     """
+    device = next(world_model.parameters()).device
     if "disturbed" not in episodes:
         episodes = episodes.copy().set("disturbed", torch.zeros(*episodes.shape, 1, dtype=torch.bool))
     parts = []
     for copy in range(copies + 1):
         for chunk in tqdm(episodes.split(batch), f"states {copy + 1}/{copies + 1}", leave=False):
+            chunk = chunk.to(device)
             if copy:
                 chunk = _start_anywhere(chunk, generator)
                 # Neither shifted nor mirrored: an obstacle has its place, and an expert may prefer one side.
@@ -57,8 +59,9 @@ def _start_anywhere(episodes: TensorDictBase, generator: torch.Generator) -> Ten
     stands still when control begins. So it must often decide by what it sees.
     """
     count, steps = episodes.shape
-    start = torch.randint(steps // 2, (count, 1), generator=generator)
-    index = start + torch.arange(steps)
-    episodes = episodes[torch.arange(count)[:, None], index.clamp(max=steps - 1)]
+    device = generator.device
+    start = torch.randint(steps // 2, (count, 1), generator=generator, device=device)
+    index = start + torch.arange(steps, device=device)
+    episodes = episodes[torch.arange(count, device=device)[:, None], index.clamp(max=steps - 1)]
     over = (index >= steps).unsqueeze(-1)
     return episodes.set("disturbed", episodes["disturbed"] | over)

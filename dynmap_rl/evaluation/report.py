@@ -89,6 +89,7 @@ def write_report(
         "command": command_line(),
         "results": results,
     }
+    world_model.cpu()  # as the episodes are
     if source["training"] != "end_to_end":  # whose decoders are not trained
         plot_reconstruction(world_model, episodes[:3], folder / "figures" / "reconstruction.png")
     plot_dynamics(world_model, episodes[0], folder / "figures" / "dynamics.png")

@@ -28,7 +28,8 @@ def roll_out(actor: Actor, task: str, seeds: list[int], keep_pixels: bool = Fals
         these rollouts (zeros at t = 0).
     """
     actor = actor.eval()
-    env = DynmapBatchedEnv(task, len(seeds), from_pixels=True, pixels_only=True)
+    device = next(actor.parameters()).device
+    env = DynmapBatchedEnv(task, len(seeds), from_pixels=True, pixels_only=True, device=device)
     td = env.reset(TensorDict({"scene_seed": torch.tensor(seeds)}, [len(seeds)]))
     keys = [
         "action",
@@ -38,7 +39,7 @@ def roll_out(actor: Actor, task: str, seeds: list[int], keep_pixels: bool = Fals
     ]
     keys += ["pixels"] if keep_pixels else []
     steps = []
-    predicted = {q: torch.zeros(len(seeds), 6) for q in actor.world_model.supervision}
+    predicted = {q: torch.zeros(len(seeds), 6, device=device) for q in actor.world_model.supervision}
     for _ in tqdm(range(EPISODE_STEPS), f"{len(seeds)} episodes", unit="step", leave=False):
         td = env.step(actor(td))
         step = td.select(*keys)
@@ -47,7 +48,7 @@ def roll_out(actor: Actor, task: str, seeds: list[int], keep_pixels: bool = Fals
         td = step_mdp(td, keep_other=False)
         states = td["predicted_latent"], td["hidden1"], td["hidden2"]
         predicted = actor.world_model.decode_dynamics(*states)
-    return torch.stack(steps, 1)
+    return torch.stack(steps, 1).cpu()
 
 
 def episode_rows(episodes: TensorDict, seeds: list[int]) -> list[dict]:

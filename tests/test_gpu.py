@@ -1,0 +1,49 @@
+"""On a GPU, where there is one: nothing in a training step waits for it, and runs end to end."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from dynmap_rl.data import add_distractors, augment, compute_features, load_dataset, load_meta, sample_windows
+from dynmap_rl.evaluation import roll_out, scene_seeds
+from dynmap_rl.modules import Actor, make_policy, make_world_model
+from dynmap_rl.objectives import WorldModelLoss
+from dynmap_rl.training import make_optimizer, mixed_precision, step, train_policy, train_world_model
+
+pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+SETTINGS = SimpleNamespace(
+    updates=4, windows=2, window_steps=6, rgb_steps=2, distractors=3, learning_rate=1e-3, beta_z=0.1,
+    beta_dynamics=1.0, world_model_seed=0, policy_updates=4, policy_batch=2, policy_learning_rate=1e-3, emphasis=60.0,
+)  # fmt: skip
+
+
+def test_a_training_step_does_not_wait_for_the_gpu(recording):
+    episodes = load_dataset(recording, "train").exclude("next").to("cuda")
+    model = make_world_model(load_meta(recording)["normalization"], ("position",)).cuda()
+    loss_module, optimizer = WorldModelLoss(model, rgb_steps=2), make_optimizer(model, 1e-3, 1e-4)
+    generator = torch.Generator("cuda").manual_seed(0)
+    for mode in ("default", "error"):  # the first time, kernels are loaded
+        torch.cuda.set_sync_debug_mode(mode)
+        try:
+            windows = augment(sample_windows(episodes, 4, 8, generator), generator)
+            windows = add_distractors(windows, generator)
+            with mixed_precision("cuda"):
+                losses = loss_module(windows)
+            step(sum(losses.values()), optimizer)
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+
+
+def test_training_and_control_end_to_end(recording, tmp_path):
+    episodes = {split: load_dataset(recording, split) for split in ("train", "eval")}
+    constants = load_meta(recording)["normalization"]
+    model = make_world_model(constants, ("position",)).cuda()
+    train_world_model(model, episodes, tmp_path, SETTINGS)
+    model.eval().requires_grad_(False)
+    features = compute_features(model, episodes["train"], 1, torch.Generator("cuda").manual_seed(0))
+    policy = make_policy(constants, "recurrent", model).cuda()
+    train_policy(policy, features, features, tmp_path / "policy", SETTINGS, 0)
+    rollout = roll_out(Actor(model, policy), "balance_reaching", scene_seeds("validation", 2))
+    assert rollout.device is None or rollout.device.type == "cpu"
+    assert rollout["action"].isfinite().all()
