@@ -1,5 +1,6 @@
 """What the README says: its snippets run, and its numbers are those of the results in the repository."""
 
+import importlib
 import json
 import re
 from pathlib import Path
@@ -85,3 +86,9 @@ def test_ranges_of_the_dynamics_are_those_of_the_results():
     )
     speeds = f"{one['block angular velocity'][2]:.1f} and {three['block angular velocity'][2]:.0f} rad/s"
     assert speeds in text
+
+
+def test_the_speed_table_is_that_of_the_results(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "tests/benchmarks")
+    benchmarks = importlib.import_module("run")
+    assert benchmarks.markdown(json.loads(benchmarks.RESULTS.read_text())) in README

@@ -135,12 +135,12 @@ class DynmapEnv(gym.Env):
         if self.render_mode is None:
             return None
         self._large = self._large or Renderer(self._render_size)
-        return self._large.draw(self.world, self.task).copy()
+        return self._large.draw(self.world, self.task)
 
     def _observe(self):
         if self.obs_type == "state":
             return self.task.state(self.world)
-        pixels = self._frames.draw(self.world, self.task).copy()
+        pixels = self._frames.draw(self.world, self.task)
         if self.obs_type == "pixels":
             return pixels
         return {"pixels": pixels, "agent_pos": agent_pos(self.world, self.task)}

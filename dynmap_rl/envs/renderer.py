@@ -17,6 +17,13 @@ from .geometry import Polygon
 from .tasks import BalanceReaching
 from .world import World
 
+RGB = (
+    0xFF,
+    0xFF00,
+    0xFF0000,
+    0,
+)  # masks of a surface whose bytes are what a frame's are, so that none is converted
+
 
 class Renderer:
     """Draws on a bare surface: no window, no audio, no display needed.
@@ -29,11 +36,11 @@ class Renderer:
     def __init__(self, size: int = 64, supersample: int = 1):
         self.size = size
         self.scale = size * supersample
-        self.canvas = pygame.Surface((self.scale, self.scale), depth=32)
-        self.frame = pygame.Surface((size, size), depth=32) if supersample > 1 else self.canvas
+        self.canvas = pygame.Surface((self.scale, self.scale), 0, 24, RGB)
+        self.frame = pygame.Surface((size, size), 0, 24, RGB) if supersample > 1 else self.canvas
 
     def draw(self, world: World, task: BalanceReaching) -> np.ndarray:
-        """The frame, uint8 ``[size, size, 3]`` (height, width, RGB); the array is read-only."""
+        """The frame, uint8 ``[size, size, 3]`` (height, width, RGB)."""
         scene = world.scene
         self.canvas.fill(scene.background_color)
         for polygon, color in task.markers(scene):
@@ -43,8 +50,10 @@ class Renderer:
         self._fill(box(bx, by, bt, scene.block_width, scene.block_height), scene.block_color)
         if self.frame is not self.canvas:
             pygame.transform.smoothscale(self.canvas, (self.size, self.size), self.frame)
-        pixels = pygame.image.tobytes(self.frame, "RGB")
-        return np.frombuffer(pixels, dtype=np.uint8).reshape(self.size, self.size, 3)
+        rows = np.frombuffer(self.frame.get_buffer(), dtype=np.uint8).reshape(
+            self.size, -1
+        )  # padded to 4 bytes
+        return rows[:, : 3 * self.size].reshape(self.size, self.size, 3).copy()
 
     def _fill(self, polygon: Polygon, color: tuple[int, int, int]) -> None:
         scale = self.scale  # pygame truncates to the pixel that a corner lies in

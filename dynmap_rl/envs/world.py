@@ -126,7 +126,9 @@ class World:
         """
         action = self._limit(np.asarray(action, dtype=np.float64))
         action = action.astype(np.float32).astype(np.float64)  # as stored, so that a replay is bit-exact
-        self._simulate((self.action / CONTROL_DT).tolist(), (action / CONTROL_DT).tolist())
+        self._simulate(
+            [a / CONTROL_DT for a in self.action.tolist()], [a / CONTROL_DT for a in action.tolist()]
+        )
         self.action = action
         self.commanded = self.commanded + action
         velocity = self._read_velocity()
@@ -185,7 +187,7 @@ class World:
     @property
     def goal_distance(self) -> float:
         """Distance of the cart's centre and the goal (m)."""
-        return math.dist(self.position[:2], self.goal)
+        return math.dist(self.position[:2].tolist(), self.goal.tolist())
 
     @property
     def position_error(self) -> float:
@@ -194,21 +196,16 @@ class World:
         return sum(last) / len(last)
 
 
-AXES = list(
-    zip(
-        *(a.tolist() for a in (WORKSPACE_LOW, WORKSPACE_HIGH, VELOCITY_LIMIT, ACCELERATION_LIMIT)),
-        strict=True,
-    )
-)
-
-
 def _limit_axis(action: float, last: float, commanded: float, axis: tuple[float, ...]) -> float:
     """One axis of :meth:`World._limit`; plain numbers, for arrays of three are ten times slower."""
-    low, high, velocity, acceleration = axis
-    backwards = min(velocity, _braking_speed(max(commanded - low, 0.0), acceleration)) * CONTROL_DT
-    forwards = min(velocity, _braking_speed(max(high - commanded, 0.0), acceleration)) * CONTROL_DT
+    low, high, velocity, acceleration, room = axis
+    backwards = forwards = velocity
+    if commanded - low < room:
+        backwards = min(velocity, _braking_speed(max(commanded - low, 0.0), acceleration))
+    if high - commanded < room:
+        forwards = min(velocity, _braking_speed(max(high - commanded, 0.0), acceleration))
     change = acceleration * CONTROL_DT**2
-    action = min(max(action, -backwards), forwards)
+    action = min(max(action, -backwards * CONTROL_DT), forwards * CONTROL_DT)
     return min(max(action, last - change), last + change)
 
 
@@ -216,3 +213,17 @@ def _braking_speed(room: float, acceleration: float) -> float:
     """The speed from which the cart still stops within ``room``, braking at the limit in whole control steps."""
     brake = acceleration * CONTROL_DT
     return math.sqrt(brake**2 / 4 + 2 * acceleration * room) - brake / 2
+
+
+def _axis(low: float, high: float, velocity: float, acceleration: float) -> tuple[float, ...]:
+    """The limits of an axis, and the room within which its edges slow the cart down, a little more than needed."""
+    return low, high, velocity, acceleration, 1.001 * velocity * (velocity / acceleration + CONTROL_DT) / 2
+
+
+AXES = [
+    _axis(*limits)
+    for limits in zip(
+        *(a.tolist() for a in (WORKSPACE_LOW, WORKSPACE_HIGH, VELOCITY_LIMIT, ACCELERATION_LIMIT)),
+        strict=True,
+    )
+]
