@@ -3,7 +3,6 @@
     python recipes/tables.py --dry_run                  # the cells, what is done, the time that is left
     python recipes/tables.py                            # all of them, one after the other
     python recipes/tables.py --only balance_reaching_decoupled_position --workers 2
-    python recipes/tables.py --launcher ray             # the same cells on a Ray cluster (pip install dynmap_rl[ray])
     python recipes/tables.py --print markdown           # or json: the tables from the results alone
 
 A cell is a run of another recipe; its result is a JSON in ``results``. World models are trained once and reused. A killed
@@ -37,8 +36,6 @@ class Config:
     only: str = ""
     # Cells at a time; each trains its policies in two processes.
     workers: int = 1
-    # Where cells run: local, or ray (on the cluster that Ray finds, with this folder on every node).
-    launcher: str = "local"
     # List the cells and stop.
     dry_run: bool = False
     # Print the tables as markdown or json and stop.
@@ -128,21 +125,11 @@ def launch(cells: list[Cell], config: Config) -> list[str]:
         print(f"done: {cell.name}", flush=True)
         return None
 
-    if config.launcher == "ray":
-        try:
-            import ray
-        except ImportError as error:
-            raise ValueError("--launcher ray needs Ray: pip install 'dynmap_rl[ray]'") from error
-        ray.init(ignore_reinit_error=True)
-        remote = ray.remote(num_cpus=2, max_retries=0)(attempt)
-        return [message for message in ray.get([remote.remote(cell) for cell in cells]) if message]
     with ThreadPoolExecutor(config.workers) as pool:
         return [message for message in pool.map(attempt, cells) if message]
 
 
 def main(config: Config) -> None:
-    if config.launcher not in ("local", "ray"):
-        raise ValueError(f"--launcher is local or ray, not {config.launcher!r}")
     if config.print:
         from dynmap_rl.evaluation.tables import print_tables
 
