@@ -54,6 +54,10 @@ class Cell:
     needs: str | None = None
 
     @property
+    def task(self) -> str:
+        return self.arguments[self.arguments.index("--task") + 1] if "--task" in self.arguments else TASKS[0]
+
+    @property
     def minutes(self) -> int:
         return MINUTES["reuse" if self.recipe == "decoupled" and self.needs else self.recipe]
 
@@ -148,12 +152,8 @@ def main(config: Config) -> None:
     if not config.smoke:
         from dynmap_rl.data import record_dataset
 
-        for task in TASKS:  # here, so that cells do not record at the same time
-            if any(
-                task == dict(zip(c.arguments[::2], c.arguments[1::2], strict=True)).get("--task", TASKS[0])
-                for c in todo
-            ):
-                record_dataset(Path("datasets") / task, task)
+        for task in {cell.task for cell in todo}:  # here, so that cells do not record at the same time
+            record_dataset(Path("datasets") / task, task)
     failed = launch([cell for cell in todo if not cell.needs], config)
     ready = [c for c in todo if c.needs and (config.runs / c.needs / "eval.json").exists()]
     missing = [c.name for c in todo if c.needs and c not in ready]

@@ -168,12 +168,3 @@ def _step_worlds(num_envs: int = 64, steps: int = 400):
 
 def _count(amount: int = 20_000_000):
     return lambda: sum(range(amount)), amount
-
-
-def scaling(sizes=(6, 60, 600), steps: int = 30) -> dict[str, dict]:
-    """Seconds for so many worlds in one batch."""
-    times = {}
-    for size in sizes:
-        env = DynmapBatchedEnv(num_envs=size, seed=0)
-        times[str(size)] = seconds(lambda env=env: env.rollout(steps, break_when_any_done=False))
-    return times
