@@ -95,7 +95,8 @@ def plot_distributions(dynamics: dict[str, TensorDictBase], path: Path) -> dict[
         for row, (task, value) in enumerate(values.items()):
             axis = axes[row, column]
             axis.hist(value, bins=np.linspace(-limit, limit, 81), log=True, color="tab:green")
-            axis.set_title(f"{task}: {title} [{unit}]", fontsize=7)
+            axis.set_title(f"{title} [{unit}]" if row == 0 else "", fontsize=8)
+            axis.set_ylabel(task if column == 0 else "", fontsize=8)
             axis.tick_params(labelsize=6)
             ranges[task][title] = np.quantile(np.abs(value), (0.001, 0.5, 0.999)).round(4).tolist()
     _save(figure, path)
