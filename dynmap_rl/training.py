@@ -15,7 +15,7 @@ from tqdm import tqdm
 from dynmap_rl import runs
 from dynmap_rl.data import add_distractors, augment, compute_features, sample_windows
 from dynmap_rl.envs.tasks import get_task
-from dynmap_rl.modules import WorldModel
+from dynmap_rl.modules import WorldModel, mixed_precision
 from dynmap_rl.objectives import JointLoss, WorldModelLoss, imitation_loss
 
 STATES = ("latent", "hidden1", "hidden2")
@@ -197,7 +197,7 @@ def prediction_errors(world_model: WorldModel, episodes: TensorDictBase, batch: 
     device = next(world_model.parameters()).device
     for chunk in episodes.split(batch):
         chunk = chunk.to(device)
-        states = world_model.predict(world_model.encode(chunk["pixels"]), chunk["action"])
+        states = world_model.predict(world_model.encode(chunk["pixels"], mixed=True), chunk["action"])
         some = [s[:, 1::10] for s in states]  # a tenth of the frames is enough
         error = world_model.decode_pixels(*some) - chunk["pixels"][:, 1::10] / 255
         errors = {"rgb": error.square().flatten(2).mean(-1).sqrt().mean()}
@@ -225,15 +225,6 @@ def fingerprint(module: nn.Module) -> str:
         digest.update(name.encode())
         digest.update(value.cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()
-
-
-def mixed_precision(device: torch.device | str) -> torch.autocast:
-    """bfloat16 where the processor computes with it: a recurrent policy's update takes a third of the time."""
-    kind = torch.device(device).type
-    fast = kind != "cpu" or (
-        torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported()
-    )
-    return torch.autocast(kind, torch.bfloat16, enabled=fast)
 
 
 def make_optimizer(module: nn.Module, learning_rate: float, weight_decay: float) -> torch.optim.Optimizer:

@@ -3,6 +3,7 @@
     python recipes/tables.py --dry_run                  # the cells, what is done, the time that is left
     python recipes/tables.py                            # all of them, one after the other
     python recipes/tables.py --only balance_reaching_decoupled_position --workers 2
+    python recipes/tables.py --launcher ray             # on a Ray cluster (pip install "dynmap_rl[ray]")
     python recipes/tables.py --print markdown           # or json: the tables from the results alone
 
 A cell is a run of another recipe; its result is a JSON in ``results``. World models are trained once and reused. A killed
@@ -11,7 +12,8 @@ run loses at most what its cells in flight have not saved yet; the same command 
 
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,8 +36,13 @@ class Config:
     runs: Path = Path("runs/tables")
     # Only cells whose name holds this.
     only: str = ""
-    # Cells at a time; each trains its policies in two processes.
+    # Cells at a time on this machine; each trains its policies in two processes.
     workers: int = 1
+    # local, or ray: the cluster that RAY_ADDRESS names, or one on this machine. Its machines share this folder.
+    launcher: str = "local"
+    # CPUs and GPUs that Ray sets aside for a cell.
+    cpus: float = 2
+    gpus: float = 0
     # List the cells and stop.
     dry_run: bool = False
     # Print the tables as markdown or json and stop.
@@ -97,40 +104,69 @@ def list_cells() -> list[Cell]:
     return first + second
 
 
-def run_cell(cell: Cell, config: Config) -> None:
-    """Run the recipe, which goes on where it was stopped, and keep its ``eval.json``.
-
-    Raises:
-        OSError: the recipe failed; the message is its own.
-    """
+def run_cell(cell: Cell, config: Config, root: Path) -> str | None:
+    """Run the recipe in ``root``, where it goes on where it was stopped, and keep its ``eval.json``; a message if it
+    failed."""
     from dynmap_rl.runs import read_json, write_json
 
-    folder = config.runs / cell.name
+    folder, log = config.runs / cell.name, root / config.runs / f"{cell.name}.log"
     command = [sys.executable, str(RECIPES / f"{cell.recipe}.py"), *cell.arguments, "--run", str(folder)]
     if cell.needs:
         command += ["--world_model", str(config.runs / cell.needs)]
+    if cell.recipe == "decoupled" and config.workers > 1:
+        command += ["--threads", "1"]
     command += ["--smoke"] if config.smoke else []
-    config.runs.mkdir(parents=True, exist_ok=True)
-    with open(config.runs / f"{cell.name}.log", "a") as log:
-        failed = subprocess.run(command, stdout=log, stderr=log).returncode
-    if failed:
-        raise OSError(f"{cell.name} failed; see {config.runs / cell.name}.log")
-    write_json(config.results / f"{cell.name}.json", read_json(folder / "eval.json"))
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with open(log, "a") as file:
+        if subprocess.run(command, cwd=root, stdout=file, stderr=file).returncode:
+            return f"{cell.name} failed; see {config.runs / cell.name}.log"
+    write_json(root / config.results / f"{cell.name}.json", read_json(root / folder / "eval.json"))
+    return None
+
+
+def launch_local(cells: list[Cell], config: Config) -> Iterator[tuple[Cell, str | None]]:
+    """Every cell with its message, in the order in which they end; each is a process of its own."""
+    with ThreadPoolExecutor(config.workers) as pool:
+        running = {pool.submit(run_cell, cell, config, Path.cwd()): cell for cell in cells}
+        for future in as_completed(running):
+            yield running[future], future.result()
+
+
+def launch_ray(cells: list[Cell], config: Config) -> Iterator[tuple[Cell, str | None]]:
+    """The same on a Ray cluster.
+
+    Raises:
+        ValueError: Ray is not installed.
+    """
+    try:
+        import ray
+    except ImportError as error:
+        raise ValueError('--launcher ray needs Ray: pip install "dynmap_rl[ray]"') from error
+    if not ray.is_initialized():
+        ray.init(log_to_driver=False)
+    remote = ray.remote(num_cpus=config.cpus, num_gpus=config.gpus, max_retries=0)(run_cell)
+    running = {remote.remote(cell, config, Path.cwd()): cell for cell in cells}
+    while running:
+        (done,), _ = ray.wait(list(running))
+        cell = running.pop(done)
+        try:
+            yield cell, ray.get(done)
+        except ray.exceptions.RayError as error:
+            yield cell, f"{cell.name} was lost by Ray ({type(error).__name__}); the same command goes on"
+
+
+LAUNCHERS = {"local": launch_local, "ray": launch_ray}
 
 
 def launch(cells: list[Cell], config: Config) -> list[str]:
     """Run cells that do not depend on each other; the messages of those that failed."""
-
-    def attempt(cell: Cell) -> str | None:
-        try:
-            run_cell(cell, config)
-        except OSError as error:
-            return str(error)
-        print(f"done: {cell.name}", flush=True)
-        return None
-
-    with ThreadPoolExecutor(config.workers) as pool:
-        return [message for message in pool.map(attempt, cells) if message]
+    failed = []
+    for cell, message in LAUNCHERS[config.launcher](cells, config) if cells else ():
+        if message:
+            failed.append(message)
+        else:
+            print(f"done: {cell.name}", flush=True)
+    return failed
 
 
 def main(config: Config) -> None:
@@ -138,6 +174,8 @@ def main(config: Config) -> None:
         from dynmap_rl.evaluation.tables import print_tables
 
         return print_tables(config.results, config.print)
+    if config.launcher not in LAUNCHERS:
+        raise ValueError(f"--launcher is {' or '.join(LAUNCHERS)}, not {config.launcher!r}")
     cells = [cell for cell in list_cells() if config.only in cell.name]
     if not cells:
         raise ValueError(f"no cell's name holds {config.only!r}; --dry_run lists them")

@@ -7,9 +7,9 @@ import torch
 
 from dynmap_rl.data import add_distractors, augment, compute_features, load_dataset, load_meta, sample_windows
 from dynmap_rl.evaluation import roll_out, scene_seeds
-from dynmap_rl.modules import Actor, make_policy, make_world_model
+from dynmap_rl.modules import Actor, make_policy, make_world_model, mixed_precision
 from dynmap_rl.objectives import WorldModelLoss
-from dynmap_rl.training import make_optimizer, mixed_precision, step, train_policy, train_world_model
+from dynmap_rl.training import make_optimizer, step, train_policy, train_world_model
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 SETTINGS = SimpleNamespace(

@@ -7,8 +7,8 @@ from tensordict import TensorDict
 
 from dynmap_rl import frozen, runs
 from dynmap_rl.data import compute_features
-from dynmap_rl.modules import DYNAMICS, make_policy, make_world_model
-from dynmap_rl.training import fingerprint, mixed_precision, train_policy, train_world_model
+from dynmap_rl.modules import DYNAMICS, make_policy, make_world_model, mixed_precision
+from dynmap_rl.training import fingerprint, train_policy, train_world_model
 
 CONSTANTS = {
     "action": {"low": [-0.02, -0.02, -0.05], "high": [0.02, 0.02, 0.05]},
@@ -136,7 +136,7 @@ def test_features_are_the_plain_episodes_first_then_the_copies():
     assert not features["disturbed"][:3].any()
     assert not torch.equal(features["latent"][3:6], features["latent"][:3])
     with torch.no_grad():
-        torch.testing.assert_close(features["latent"][:3], model.encode(episodes["pixels"]))
+        torch.testing.assert_close(features["latent"][:3], model.encode(episodes["pixels"], mixed=True))
 
 
 def test_a_copy_begins_anywhere_with_an_empty_memory_and_ends_where_the_episode_ends():

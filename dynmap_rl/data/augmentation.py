@@ -6,6 +6,7 @@ import torch
 from tensordict import TensorDictBase
 
 METERS_PER_PIXEL = 1 / 64
+THICKEST, LONGEST = 4, 24  # of a bar, pixels
 
 
 def sample_windows(
@@ -68,18 +69,23 @@ def add_distractors(windows: TensorDictBase, generator: torch.Generator, most: i
     tell objects that it does not know from cart and block. Windows must be drawn on one background colour.
     """
     pixels = windows["pixels"]
-    background = pixels[:, 0].flatten(2).mode(2).values[:, None, :, None, None]  # (B, 1, 3, 1, 1)
-    red, green, blue = (pixels == background).unbind(2)  # (B, T, 64, 64)
-    bars = _draw_bars(len(pixels), most, pixels.shape[-1], generator)
-    painted = (red & green & blue & bars[:, None]).unsqueeze(2)
-    colors = _draw_colors(len(pixels), generator)[:, None, :, None, None]
-    return windows.clone(False).set("pixels", torch.where(painted, colors, pixels))
+    background = pixels[:, 0].flatten(2).mode(2).values[:, None, :, None]  # (B, 1, 3, 1)
+    bars = _draw_bars(len(pixels), most, pixels.shape[-1], generator).flatten(1)  # (B, 64 * 64)
+    # Only where a bar may be: a fixed number of places, of which the first are the bars'.
+    places = min(most * THICKEST * LONGEST, bars.shape[1])
+    inside, place = bars.to(torch.uint8).topk(places, sorted=False)  # (B, places)
+    place = place[:, None, None].expand(*pixels.shape[:3], -1)
+    there = pixels.flatten(3).gather(3, place)  # (B, T, 3, places)
+    painted = (there == background).all(2, keepdim=True) & inside.bool()[:, None, None]
+    colors = _draw_colors(len(pixels), generator)[:, None, :, None]
+    painted = pixels.flatten(3).scatter(3, place, torch.where(painted, colors, there))
+    return windows.clone(False).set("pixels", painted.view_as(pixels))
 
 
 def _draw_bars(batch: int, most: int, size: int, generator: torch.Generator) -> torch.Tensor:
     """Masks ``[B, size, size]`` of 0 to ``most`` upright or level bars each, 1 to 4 pixels thick."""
     shape = batch, most
-    thick, long = _integers(1, 5, shape, generator), _integers(4, 25, shape, generator)
+    thick, long = _integers(1, THICKEST + 1, shape, generator), _integers(4, LONGEST + 1, shape, generator)
     upright = _integers(0, 2, shape, generator).bool()
     rows = _span(torch.where(upright, long, thick), size, generator)[..., None]
     columns = _span(torch.where(upright, thick, long), size, generator)[..., None, :]

@@ -42,7 +42,7 @@ def compute_features(
                 chunk = _start_anywhere(chunk, generator)
                 # Neither shifted nor mirrored: an obstacle has its place, and an expert may prefer one side.
                 chunk = augment(chunk, generator, max_shift=0, mirror=False)
-            latent = world_model.encode(chunk["pixels"])
+            latent = world_model.encode(chunk["pixels"], mixed=True)
             _, hidden1, hidden2 = world_model.predict(latent, chunk["action"])
             features = {"latent": latent, "hidden1": hidden1, "hidden2": hidden2}
             parts.append(

@@ -39,7 +39,7 @@ def evaluate(
         raise ValueError(f"there are {SHARED_STARTS} shared start states, not {test_episodes}")
     seeds = scene_seeds(split, test_episodes)
     seeds += scene_seeds(split, paper_episodes, start=SHARED_STARTS)
-    rows = episode_rows(roll_out(Actor(world_model, policy), task, seeds), seeds)
+    rows = episode_rows(roll_out(Actor(world_model, policy, mixed=True), task, seeds), seeds)
     parts = {"test": rows[:test_episodes], "paper": rows[test_episodes:]}
     return {name: {"summary": summarize(part), "rows": _columns(part)} for name, part in parts.items()}
 
@@ -95,7 +95,7 @@ def write_report(
     plot_dynamics(world_model, episodes[0], folder / "figures" / "dynamics.png")
     policy = load_policy(folder / f"seed_{seeds[0]}" / "policy")
     some = [scene_seed("validation", i) for i in range(8)]
-    rollouts = roll_out(Actor(world_model, policy), settings.task, some, keep_pixels=True)
+    rollouts = roll_out(Actor(world_model, policy, mixed=True), settings.task, some, keep_pixels=True)
     save_gif(rollouts, folder / "rollouts.gif")
     write_json(folder / "eval.json", result)
     return result

@@ -13,6 +13,7 @@ from .decoder import DYNAMICS, DynamicsDecoder, ImageDecoder
 from .encoder import Encoder, SpatialSoftmax
 from .normalization import Normalizer
 from .policy import FeedforwardPolicy, RecurrentPolicy
+from .precision import mixed_precision
 from .recurrent import TwoLSTM, delay
 from .tensordict_modules import Actor, make_policy_module, make_world_model_module
 from .transition import Transition
@@ -39,6 +40,7 @@ __all__ = [
     "make_policy_module",
     "make_world_model",
     "make_world_model_module",
+    "mixed_precision",
     "save_policy",
     "save_world_model",
 ]

@@ -6,8 +6,9 @@ from collections.abc import Mapping
 
 import torch
 from torch import nn
+from torch.nn import functional as F
 
-from .layers import up
+from .layers import BLOCK, up
 from .normalization import Normalizer
 
 DYNAMICS = ("position", "velocity", "acceleration")
@@ -18,28 +19,31 @@ class ImageDecoder(nn.Module):
 
     Args:
         input_size: Z + 2 H.
-        channels: of the maps of stride 8, 4 and 2.
+        channels: of the maps of stride 8 and 4.
     """
 
-    def __init__(self, input_size: int, channels: tuple[int, int, int] = (64, 32, 16)):
+    def __init__(self, input_size: int, channels: tuple[int, int] = (64, 32)):
         super().__init__()
-        c1, c2, c3 = channels
+        c1, c2 = channels
         self.expand = nn.Linear(input_size, c1 * 64)
         self.layers = nn.Sequential(
             nn.Unflatten(1, (c1, 8, 8)),
             nn.ReLU(),
             up(c1, c2),
-            up(c2, c3),
-            nn.ConvTranspose2d(c3, 3, 4, 2, 1),
+            nn.Conv2d(c2, 3 * BLOCK**2, 3, 1, 1),
         )
 
     def forward(
         self, predicted_latent: torch.Tensor, hidden1: torch.Tensor, hidden2: torch.Tensor
     ) -> torch.Tensor:
+        return F.pixel_shuffle(self.decode_blocks(predicted_latent, hidden1, hidden2), BLOCK) + 0.5
+
+    def decode_blocks(
+        self, predicted_latent: torch.Tensor, hidden1: torch.Tensor, hidden2: torch.Tensor
+    ) -> torch.Tensor:
+        """The frame less 0.5 as blocks ``[..., 48, 16, 16]`` (see :func:`dynmap_rl.modules.layers.to_blocks`)."""
         x = torch.cat([predicted_latent, hidden1, hidden2], -1)
-        batch = x.shape[:-1]
-        x = self.expand(x.reshape(-1, x.shape[-1]))
-        return (self.layers(x) + 0.5).reshape(*batch, 3, 64, 64)
+        return self.layers(self.expand(x).flatten(0, -2)).unflatten(0, x.shape[:-1])
 
 
 class DynamicsDecoder(nn.Module):

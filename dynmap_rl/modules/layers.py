@@ -6,6 +6,22 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
+BLOCK = 4  # encoder and decoder see frames as blocks of 4 x 4 pixels
+
+
+def to_blocks(pixels: torch.Tensor) -> torch.Tensor:
+    """Frames ``[N, 3, 64, 64]`` as blocks of 4 x 4 pixels, ``[N, 48, 16, 16]`` in channels-last memory.
+
+    A convolution over blocks does what one of four times the kernel and stride does to pixels, and a processor's
+    matrix units are made for 48 channels, not for 3.
+    """
+    if pixels.dtype != torch.uint8:
+        return F.pixel_unshuffle(pixels, BLOCK).contiguous(memory_format=torch.channels_last)
+    # Four bytes in a row move as one number: four times as fast.
+    rows = pixels.contiguous().view(torch.int32)  # (N, 3, 64, 16)
+    blocks = rows.unflatten(2, (-1, BLOCK)).permute(0, 2, 4, 1, 3).contiguous()  # (N, 16, 16, 3, 4)
+    return blocks.view(torch.uint8).flatten(3).permute(0, 3, 1, 2)
+
 
 class ChannelNorm(nn.Module):
     """LayerNorm over the channels of every pixel, ``[N, C, H, W]``.
@@ -27,7 +43,7 @@ class ChannelNorm(nn.Module):
 
 def down(inputs: int, outputs: int) -> nn.Sequential:
     """Half the resolution."""
-    return nn.Sequential(nn.Conv2d(inputs, outputs, 4, 2, 1), ChannelNorm(outputs), nn.ReLU())
+    return nn.Sequential(nn.Conv2d(inputs, outputs, 3, 2, 1), ChannelNorm(outputs), nn.ReLU())
 
 
 def same(channels: int) -> nn.Sequential:

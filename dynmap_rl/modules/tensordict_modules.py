@@ -60,6 +60,7 @@ class Actor(TensorDictModuleBase):
     Args:
         world_model, policy: what acts.
         pixels, goal, action, is_init: keys.
+        mixed: encode frames in the precision of training (see :meth:`WorldModel.encode`), as recipes do.
     """
 
     def __init__(
@@ -70,9 +71,10 @@ class Actor(TensorDictModuleBase):
         goal: NestedKey = "goal",
         action: NestedKey = "action",
         is_init: NestedKey = "is_init",
+        mixed: bool = False,
     ):
         super().__init__()
-        self.world_model, self.policy = world_model, policy
+        self.world_model, self.policy, self.mixed = world_model, policy, mixed
         self.pixels, self.goal, self.action, self.is_init = pixels, goal, action, is_init
         recurrent = isinstance(policy, RecurrentPolicy)
         self.policy_memory = tuple(f"policy_{key}" for key in MEMORY) if recurrent else ()
@@ -83,7 +85,7 @@ class Actor(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         pixels, goal = tensordict.get(self.pixels), tensordict.get(self.goal)
         state = self._recall(tensordict, MEMORY, self.world_model.hidden_size)
-        latent = self.world_model.encode(pixels)
+        latent = self.world_model.encode(pixels, self.mixed)
         policy_state = None
         if self.policy_memory:
             policy_state = self._recall(tensordict, self.policy_memory, self.policy.lstm.hidden_size)

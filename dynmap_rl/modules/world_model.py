@@ -10,6 +10,7 @@ from torch import nn
 from .decoder import DynamicsDecoder, ImageDecoder
 from .encoder import Encoder
 from .normalization import Normalizer
+from .precision import mixed_precision
 from .recurrent import State
 from .transition import Transition
 
@@ -44,9 +45,13 @@ class WorldModel(nn.Module):
         """The quantities that are decoded."""
         return self.dynamics_decoder.quantities
 
-    def encode(self, pixels: torch.Tensor) -> torch.Tensor:
-        """``z_t = ENC(I_t)``: frames ``[..., 3, 64, 64]`` to latents ``[..., Z]``."""
-        return self.encoder(pixels)
+    def encode(self, pixels: torch.Tensor, mixed: bool = False) -> torch.Tensor:
+        """``z_t = ENC(I_t)``: frames ``[..., 3, 64, 64]`` to latents ``[..., Z]``, with ``mixed`` in the precision
+        of training (:func:`mixed_precision`), up to three times as fast."""
+        if not mixed:
+            return self.encoder(pixels)
+        with mixed_precision(pixels.device):
+            return self.encoder(pixels).float()
 
     def predict(
         self, latent: torch.Tensor, action: torch.Tensor

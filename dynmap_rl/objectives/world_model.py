@@ -10,6 +10,7 @@ from tensordict.utils import NestedKey
 from torchrl.objectives.common import LossModule
 
 from dynmap_rl.modules import WorldModel
+from dynmap_rl.modules.layers import to_blocks
 
 
 class WorldModelLoss(LossModule):
@@ -91,8 +92,10 @@ class WorldModelLoss(LossModule):
         if self.rgb_steps is not None and self.rgb_steps < steps:
             index = torch.randperm(steps, device=pixels.device)[: self.rgb_steps]
             pixels, states = pixels[:, index], [s[:, index] for s in states]
-        frames = self.world_model.decode_pixels(*states).float()
-        return rms((frames - pixels.to(frames.dtype) / 255).flatten(-3)).mean()
+        blocks = self.world_model.image_decoder.decode_blocks(*states).flatten(0, 1)
+        target = to_blocks(pixels.flatten(0, 1)).to(blocks.dtype) * (1 / 255) - 0.5
+        norm = torch.linalg.vector_norm(blocks - target, dim=(1, 2, 3)).float()
+        return norm.mean() / blocks[0].numel() ** 0.5
 
 
 def rms(x: torch.Tensor) -> torch.Tensor:

@@ -11,9 +11,9 @@ import dynmap_rl  # noqa: F401  (registers the ids)
 from dynmap_rl import data
 from dynmap_rl.envs.world import EPISODE_STEPS
 from dynmap_rl.evaluation import roll_out, scene_seeds
-from dynmap_rl.modules import Actor, WorldModel, make_policy, make_world_model
+from dynmap_rl.modules import Actor, WorldModel, make_policy, make_world_model, mixed_precision
 from dynmap_rl.objectives.world_model import WorldModelLoss, rms
-from dynmap_rl.training import make_optimizer, mixed_precision, step
+from dynmap_rl.training import make_optimizer, step
 
 SUPERVISION = ("position", "velocity")
 WINDOWS, STEPS = 16, 24
@@ -68,7 +68,7 @@ class PlainWorldModel(nn.Module):
         model, pixels = self.model, windows["pixels"]
         encoder = model.encoder
         frames = pixels.flatten(0, 1).float() / 255
-        maps = encoder.top(encoder.stem(frames - 0.5)).flatten(1)
+        maps = encoder.top(encoder.stem(nn.functional.pixel_unshuffle(frames - 0.5, 4)).relu()).flatten(1)
         color = 5 * encoder.color(frames.mean((2, 3)) - 0.5)
         latent = (encoder.project(maps) + color).unflatten(0, pixels.shape[:2])
         action = model.transition.action.normalize(windows["action"])
@@ -101,7 +101,7 @@ def evaluation(dataset: str, episodes: int = 1000, single: int = 5) -> dict:
     policy = make_policy(constants, "recurrent", world_model).eval()
 
     def ours():
-        actor = Actor(world_model, policy)
+        actor = Actor(world_model, policy, mixed=True)
         return seconds(lambda: roll_out(actor, "balance_reaching", scene_seeds("test", episodes))) / episodes
 
     env = gym.make("dynmap_rl/BalanceReaching-v0", obs_type="pixels_agent_pos")

@@ -1,6 +1,7 @@
 import pytest
 import torch
 from tensordict import TensorDict
+from torch.nn.functional import pixel_shuffle, pixel_unshuffle
 
 from dynmap_rl.modules import (
     DYNAMICS,
@@ -16,6 +17,7 @@ from dynmap_rl.modules import (
     save_policy,
     save_world_model,
 )
+from dynmap_rl.modules.layers import to_blocks
 
 CONSTANTS = {
     "action": {"low": [-0.02, -0.02, -0.05], "high": [0.02, 0.02, 0.05]},
@@ -62,6 +64,45 @@ def test_encoder_keeps_leading_axes_and_refuses_other_frames(keypoints):
     torch.testing.assert_close(encoder(frames[0, 0]), latent[0, 0], rtol=1e-4, atol=1e-5)
     with pytest.raises(ValueError, match="64"):
         encoder(torch.zeros(1, 3, 32, 32))
+
+
+def test_frames_as_blocks_and_back():
+    frames = torch.randint(0, 256, (5, 3, 64, 64), dtype=torch.uint8)
+    for pixels in (
+        frames,
+        frames.float(),
+        frames.repeat(1, 1, 1, 2)[..., 4:68],
+    ):  # the last is no whole memory
+        blocks = to_blocks(pixels)
+        assert blocks.is_contiguous(memory_format=torch.channels_last)
+        assert torch.equal(pixel_shuffle(blocks, 4), pixels)
+    assert blocks[1, :, 2, 3].tolist() == pixels[1, :, 8:12, 12:16].flatten().tolist()
+
+
+@torch.no_grad()
+def test_a_frame_s_scale_and_colour_reach_the_latent():
+    """Scaled weights on raw bytes are the same as plain weights on a frame in -0.5..0.5, but for the border."""
+    encoder = Encoder(16)
+    frames = torch.randint(0, 256, (2, 3, 64, 64), dtype=torch.uint8)
+    frames[..., [0, -1], :] = frames[..., :, [0, -1]] = 0
+    maps = encoder.stem(pixel_unshuffle(frames / 255 - 0.5, 4)).relu()[..., 1:-1, 1:-1]
+    seen = []
+    encoder.top.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0][..., 1:-1, 1:-1]))
+    latent = encoder(frames)
+    torch.testing.assert_close(seen[0], maps, rtol=1e-4, atol=1e-5)
+    plain = encoder.project.register_forward_hook(lambda _m, _i, output: 0 * output)
+    color = encoder(frames)
+    plain.remove()
+    torch.testing.assert_close(color, 5 * encoder.color(frames.float().mean((2, 3)) / 255 - 0.5))
+    assert not torch.equal(latent, color)
+
+
+@torch.no_grad()
+def test_latents_in_the_precision_of_training_are_near_the_exact_ones():
+    model, td = make(), batch()
+    exact, mixed = model.encode(td["pixels"]), model.encode(td["pixels"], mixed=True)
+    assert mixed.dtype == torch.float32
+    assert (mixed - exact).abs().max() < 0.02 * exact.abs().max()
 
 
 def test_sequence_equals_steps():

@@ -1,6 +1,7 @@
 import pytest
 import torch
 from tensordict import TensorDict
+from torch.nn.functional import pixel_unshuffle
 
 from dynmap_rl.modules import DYNAMICS, Normalizer, make_world_model
 from dynmap_rl.objectives import WorldModelLoss, imitation_loss
@@ -53,7 +54,8 @@ def test_an_off_by_one_would_be_seen():
     """A model that copies its input frame predicts a sequence shifted by one step, and only that one, exactly."""
     _, loss = make(())
     frames = torch.randint(0, 256, (1, 6, 3, 64, 64), dtype=torch.uint8)
-    loss.world_model.decode_pixels = lambda *_: frames[:, :-1] / 255  # what stood at t - 1
+    # What stood at t - 1:
+    loss.world_model.image_decoder.decode_blocks = lambda *_: pixel_unshuffle(frames[:, :-1] / 255 - 0.5, 4)
     td = TensorDict({"pixels": frames, "action": torch.zeros(1, 6, 3)}, [1, 6])
     assert loss(td)["loss_rgb"] > 0.1
     td["pixels"] = torch.cat([frames[:, :1], frames[:, :-1]], 1)

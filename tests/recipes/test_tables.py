@@ -76,6 +76,21 @@ def test_cells_run_once_and_are_printed_beside_the_paper(tmp_path):
     assert dry.count("   done  ") == 3 and "3 of 69 cells are done" in dry
 
 
+def test_ray_runs_the_same_cells(tmp_path, monkeypatch):
+    ray = pytest.importorskip("ray")
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    (tmp_path / "runs/tables/bin_dropping_joint_none_recurrent").mkdir(parents=True)
+    (tmp_path / "runs/tables/bin_dropping_joint_none_recurrent/config.json").write_text("{}")
+    result = run(tmp_path, "--smoke", "--only", "joint_none", "--launcher", "ray", "--cpus", "1")
+    names = ["balance_reaching_joint_none_recurrent", "balance_reaching_obstacle_joint_none_recurrent"]
+    assert [line.removeprefix("done: ") for line in result.stdout.splitlines()] == names, result.stderr
+    assert sorted(p.stem for p in (tmp_path / "results").iterdir()) == sorted(names)
+    assert result.returncode == 2
+    assert "bin_dropping_joint_none_recurrent failed; see runs/tables/" in result.stderr
+    assert not ray.is_initialized()  # the cluster ended with the recipe
+
+
 def test_a_cell_that_fails_says_where_to_look_and_the_others_go_on(tmp_path):
     (tmp_path / "runs/tables/balance_reaching_joint_none_recurrent").mkdir(parents=True)
     (tmp_path / "runs/tables/balance_reaching_joint_none_recurrent/config.json").write_text("{}")
@@ -92,6 +107,7 @@ def test_a_cell_that_fails_says_where_to_look_and_the_others_go_on(tmp_path):
     [
         (["--only", "nothing"], "no cell's name holds"),
         (["--print", "html"], "markdown or json"),
+        (["--launcher", "slurm"], "local or ray"),
     ],
 )
 def test_bad_input_gets_one_clear_line(tmp_path, arguments, message):
