@@ -50,6 +50,7 @@ class World:
     Attributes:
         position, velocity: read from PyMunk.
         acceleration: ``(velocity_t - velocity_{t-1}) / CONTROL_DT``, zero at the start.
+        block_in_cart: the block's pose in the cart's frame: x, y (m) from the cart's centre, and angle (rad).
         commanded: ``[3]`` commanded cart pose, the start pose plus the sum of all actions.
         action: ``[3]`` the last action as executed, after the limits.
         goal: ``[2]`` where the cart shall go.
@@ -74,6 +75,7 @@ class World:
         self.commanded = np.array([scene.cart_x, scene.cart_y, 0.0])
         self.action = np.zeros(3)
         self.position = self._read_position()
+        self.block_in_cart = self._locate_block()
         self.velocity = np.zeros(6)
         self.acceleration = np.zeros(6)
         self.steps = 0
@@ -135,6 +137,7 @@ class World:
         self.acceleration = (velocity - self.velocity) / CONTROL_DT
         self.velocity = velocity
         self.position = self._read_position()
+        self.block_in_cart = self._locate_block()
         self.steps += 1
         self.dropped = self.dropped or self._is_dropped()
         self.errors.append(self.goal_distance)
@@ -170,9 +173,7 @@ class World:
         (cx, cy), (bx, by) = self.cart.velocity, self.block.velocity
         return np.array([cx, cy, self.cart.angular_velocity, bx, by, self.block.angular_velocity])
 
-    @property
-    def block_in_cart(self) -> tuple[float, float, float]:
-        """The block's pose in the cart's frame: x, y (m) from the cart's centre, and angle (rad)."""
+    def _locate_block(self) -> tuple[float, float, float]:
         cx, cy, ct, bx, by, bt = self.position.tolist()
         c, s = math.cos(ct), math.sin(ct)
         dx, dy = bx - cx, by - cy
@@ -192,7 +193,7 @@ class World:
     @property
     def position_error(self) -> float:
         """Mean distance of cart and goal over the last 10 steps (m), PE in the paper."""
-        last = self.errors[1:][-FINAL_STEPS:] or self.errors
+        last = self.errors[max(1, len(self.errors) - FINAL_STEPS) :] or self.errors
         return sum(last) / len(last)
 
 

@@ -1,0 +1,74 @@
+"""The most memory that each recipe needs at a time, with all its processes, in its full size.
+
+    uv run python tests/benchmarks/memory.py
+
+Data, batches, models and evaluations are those of a full run; there are only fewer optimiser steps, which need the same
+memory again and again. Shared pages count once (proportional set size, so Linux only). Writes
+``recipes/results/memory.json``.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from dynmap_rl.runs import write_json
+
+RECIPES = Path(__file__).parents[2] / "recipes"
+FEW = ["--updates", "30"]
+POLICY = ["--policy_updates", "30"]
+COMMANDS = {  # in this order: later ones take the world model of earlier ones
+    "collect": ["--output", "datasets/balance_reaching"],
+    "expert": ["--run", "expert", "--iterations", "3"],
+    "decoupled": ["--run", "decoupled", *FEW, *POLICY],
+    "generalize": ["--task", "bin_dropping", "--world_model", "decoupled", "--run", "generalize", *POLICY],
+    "joint": ["--run", "joint", *FEW],
+    "end_to_end": ["--run", "end_to_end", *FEW],
+    "evaluate": [],
+}
+
+
+def peak(command: list[str], folder: str) -> float:
+    """GB that a command and its children held at most."""
+    process = subprocess.Popen(command, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    most = 0
+    while process.poll() is None:
+        most = max(most, sum(map(held, family(process.pid))))
+        time.sleep(0.1)
+    if process.returncode:
+        raise OSError(f"{' '.join(command)} failed")
+    return most / 1e6
+
+
+def family(pid: int) -> list[int]:
+    try:
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    except OSError:
+        return []
+    return [pid, *(one for child in children for one in family(int(child)))]
+
+
+def held(pid: int) -> int:
+    """kB."""
+    try:
+        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    except OSError:  # it has just ended
+        return 0
+    return next((int(line.split()[1]) for line in lines if line.startswith("Pss:")), 0)
+
+
+def main() -> None:
+    found = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for name, options in COMMANDS.items():
+            command = [sys.executable, str(RECIPES / f"{name}.py"), *options]
+            found[name] = round(peak(command, folder), 2)
+            print(f"{name}: {found[name]} GB", flush=True)
+    write_json(RECIPES / "results" / "memory.json", {"unit": "GB", "peak": found})
+
+
+if __name__ == "__main__":
+    main()
