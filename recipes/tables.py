@@ -45,7 +45,7 @@ class Config:
     gpus: float = 0
     # List the cells and stop.
     dry_run: bool = False
-    # Print the tables as markdown or json and stop.
+    # Print the tables as markdown or json, or the findings (claims of the paper, tested), and stop.
     print: str | None = None
     # Every cell in a minimal size, for tests.
     smoke: bool = False

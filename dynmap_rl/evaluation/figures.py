@@ -1,4 +1,4 @@
-"""Figures of a run: reconstruction, dynamics prediction (paper, Fig. 6), rollouts as an animation."""
+"""Figures of a run: reconstruction, dynamics prediction (paper, Fig. 6 and 9), rollouts as an animation."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ import torch
 from PIL import Image
 from tensordict import TensorDictBase
 
+from dynmap_rl.envs.tasks import REST_SPEED
+from dynmap_rl.envs.world import CONTROL_DT
 from dynmap_rl.modules import WorldModel, make_world_model_module
 
 COMPONENTS = ("x", "y", "theta")
@@ -34,31 +36,56 @@ def plot_reconstruction(
 ) -> None:
     """Held-out frames and their reconstructions from the frame before: one pair of rows an episode."""
     steps = [t for t in steps if t < episodes.shape[1]]
-    out = predict(world_model, episodes)
-    figure, axes = plt.subplots(2 * len(out), len(steps), figsize=(1.3 * len(steps), 2.7 * len(out)))
-    for row, episode in enumerate(out):
-        truth = episode["pixels"].permute(0, 2, 3, 1).numpy()
-        guess = episode["reconstruction", "pixels"].clamp(0, 1).permute(0, 2, 3, 1).float().numpy()
-        for column, t in enumerate(steps):
-            axes[2 * row, column].imshow(truth[t])
-            axes[2 * row + 1, column].imshow(guess[t])
-            axes[0, column].set_title(f"t = {t}", fontsize=9)
-        axes[2 * row, 0].set_ylabel("true", fontsize=9)
-        axes[2 * row + 1, 0].set_ylabel("predicted", fontsize=9)
-    for axis in axes.flat:
-        axis.set(xticks=[], yticks=[])
-    _save(figure, path)
+    figure = plt.figure(figsize=(1.3 * len(steps), 2.7 * len(episodes)))
+    draw_reconstruction(figure, predict(world_model, episodes), [steps] * len(episodes))
+    save_figure(figure, path)
 
 
 def plot_dynamics(world_model: WorldModel, episode: TensorDictBase, path: Path) -> None:
     """The block's true and predicted dynamics along one held-out episode ``[T]``; nothing for an Only-RGB model."""
     if not world_model.supervision:
         return
-    out = predict(world_model, episode[None])[0]
-    rows = len(world_model.supervision)
-    figure, axes = plt.subplots(rows, 3, figsize=(9, 2.2 * rows), squeeze=False, sharex=True)
-    time = np.arange(out.shape[0]) * 0.05
-    for row, quantity in enumerate(world_model.supervision):
+    figure = plt.figure(figsize=(9, 2.2 * len(world_model.supervision)))
+    draw_dynamics(figure, predict(world_model, episode[None])[0], world_model.supervision)
+    save_figure(figure, path)
+
+
+def plot_prediction(world_model: WorldModel, episodes: TensorDictBase, path: Path, title: str) -> None:
+    """Both in one picture (paper, Fig. 6 and 9): the frames of episodes ``[E, T]`` while the block moves, and the
+    dynamics of the first episode."""
+    rows, out = len(world_model.supervision), predict(world_model, episodes)
+    heights = [2.5 * len(episodes), 2.0 * rows]
+    figure = plt.figure(figsize=(10, 0.5 + sum(heights)), layout="constrained")
+    figure.suptitle(title)
+    upper, lower = figure.subfigures(2, 1, height_ratios=heights) if rows else (figure.subfigures(), None)
+    draw_reconstruction(upper, out, [moving_steps(episode, 8, first=1) for episode in out])
+    if lower:
+        draw_dynamics(lower, out[0], world_model.supervision)
+    save_figure(figure, path)
+
+
+def draw_reconstruction(figure, out: TensorDictBase, steps: list[list[int]]) -> None:
+    """Frames of episodes ``[E, T]`` (see :func:`predict`) and their reconstructions, at as many steps of each."""
+    axes = figure.subplots(2 * len(out), len(steps[0]), squeeze=False)
+    for row, episode in enumerate(out):
+        truth = episode["pixels"].permute(0, 2, 3, 1).numpy()
+        guess = episode["reconstruction", "pixels"].clamp(0, 1).permute(0, 2, 3, 1).float().numpy()
+        for column, t in enumerate(steps[row]):
+            axes[2 * row, column].imshow(truth[t])
+            axes[2 * row + 1, column].imshow(guess[t])
+            if row == 0 or steps[row] != steps[row - 1]:
+                axes[2 * row, column].set_title(f"t = {t}", fontsize=9)
+        axes[2 * row, 0].set_ylabel("true", fontsize=9)
+        axes[2 * row + 1, 0].set_ylabel("predicted", fontsize=9)
+    for axis in axes.flat:
+        axis.set(xticks=[], yticks=[])
+
+
+def draw_dynamics(figure, out: TensorDictBase, supervision: tuple[str, ...]) -> None:
+    """The block's dynamics along one episode ``[T]`` (see :func:`predict`): a row for each quantity."""
+    axes = figure.subplots(len(supervision), 3, squeeze=False, sharex=True)
+    time = np.arange(out.shape[0]) * CONTROL_DT
+    for row, quantity in enumerate(supervision):
         for column, component in enumerate(COMPONENTS):
             axis, index = axes[row, column], 3 + column
             axis.plot(time, out["dynamics", quantity][:, index], "k", lw=1, label="true")
@@ -69,7 +96,14 @@ def plot_dynamics(world_model: WorldModel, episode: TensorDictBase, path: Path) 
     for axis in axes[-1]:
         axis.set_xlabel("time [s]", fontsize=8)
     axes[0, 0].legend(fontsize=7)
-    _save(figure, path)
+
+
+def moving_steps(episode: TensorDictBase, count: int, first: int = 0) -> list[int]:
+    """``count`` steps of an episode ``[T]``, evenly spaced from ``first`` to the last in which the block moves."""
+    speed = episode["dynamics", "velocity"][:, 3:5].norm(dim=-1)
+    moving = (speed > REST_SPEED).nonzero().flatten().tolist()
+    last = min(max([first + count - 1, *moving[-1:]]), len(speed) - 1)
+    return np.linspace(first, last, count).round().astype(int).tolist()
 
 
 def plot_distributions(dynamics: dict[str, TensorDictBase], path: Path) -> dict[str, dict[str, list[float]]]:
@@ -99,7 +133,7 @@ def plot_distributions(dynamics: dict[str, TensorDictBase], path: Path) -> dict[
             axis.set_ylabel(task if column == 0 else "", fontsize=8)
             axis.tick_params(labelsize=6)
             ranges[task][title] = np.quantile(np.abs(value), (0.001, 0.5, 0.999)).round(4).tolist()
-    _save(figure, path)
+    save_figure(figure, path)
     return ranges
 
 
@@ -118,8 +152,10 @@ def save_gif(episodes: TensorDictBase, path: Path, columns: int = 4, scale: int 
     images[0].save(path, save_all=True, append_images=images[1:], duration=50, loop=0, optimize=True)
 
 
-def _save(figure, path: Path) -> None:
+def save_figure(figure, path: Path) -> None:
+    """Write the picture and close the figure, laid out tightly where it has no layout of its own."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.tight_layout()
+    if figure.get_layout_engine() is None:
+        figure.tight_layout()
     figure.savefig(path, dpi=110)
     plt.close(figure)

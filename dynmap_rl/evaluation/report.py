@@ -109,7 +109,12 @@ def _localization(results: list[dict]) -> dict[str, float]:
 
 def read_rows(path: Path) -> list[list[dict]]:
     """The rows on the shared start states of every policy seed of an ``eval.json``."""
-    return [_rows(result["test"]["rows"]) for result in read_json(path)["results"]]
+    return result_rows(read_json(path))
+
+
+def result_rows(result: dict) -> list[list[dict]]:
+    """The same of an ``eval.json`` that is already read."""
+    return [_rows(seed["test"]["rows"]) for seed in result["results"]]
 
 
 def print_row(result: dict) -> None:

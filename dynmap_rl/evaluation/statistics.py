@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import binomtest, bootstrap
+from scipy.stats import binomtest, bootstrap, permutation_test
 
 
 def summarize(rows: list[dict]) -> dict[str, float]:
@@ -50,7 +50,8 @@ def success_gap(rows_a: list[list[dict]], rows_b: list[list[dict]]) -> dict:
         rows_a, rows_b: per policy seed, the rows of the same scenes in the same order.
 
     Returns:
-        ``gap`` and its 95 % bootstrap interval over the start states, after averaging over policy seeds.
+        ``gap``, its 95 % bootstrap ``interval`` over the start states, after averaging over policy seeds, and ``p``, the
+        two-sided probability of such a gap if the two were exchanged at random in every start state.
 
     Raises:
         ValueError: the two were not evaluated on the same scenes.
@@ -62,9 +63,17 @@ def success_gap(rows_a: list[list[dict]], rows_b: list[list[dict]]) -> dict:
     def rate(rows):
         return np.mean([[row["success"] for row in seed] for seed in rows], axis=0)
 
-    difference = 100 * (rate(rows_a) - rate(rows_b))
+    a, b = rate(rows_a), rate(rows_b)
+    difference = 100 * (a - b)
     gap = float(difference.mean())
     if np.ptp(difference) == 0:
-        return {"gap": gap, "interval": (gap, gap)}
+        return {"gap": gap, "interval": (gap, gap), "p": 1.0 if gap == 0 else 0.0}
     interval = bootstrap((difference,), np.mean, rng=np.random.default_rng(0)).confidence_interval
-    return {"gap": gap, "interval": (float(interval.low), float(interval.high))}
+    test = permutation_test(
+        (a, b), _mean_difference, permutation_type="samples", batch=500, rng=np.random.default_rng(0)
+    )
+    return {"gap": gap, "interval": (float(interval.low), float(interval.high)), "p": float(test.pvalue)}
+
+
+def _mean_difference(a: np.ndarray, b: np.ndarray, axis: int) -> np.ndarray:
+    return a.mean(axis) - b.mean(axis)

@@ -18,15 +18,16 @@ COLUMNS = {  # table: its columns, as (task, training, policy)
 ROWS = list(TABLES["bin_dropping", "joint", "recurrent"])  # in the paper's order, End-to-End first
 
 
-def read_cells(results: Path) -> dict[tuple, dict]:
-    """The results of a folder by ``(task, training, policy, row)``; those the paper has no cell for are left out."""
+def read_cells(results: Path, world_model_seed: int = 0) -> dict[tuple, dict]:
+    """The results of a folder by ``(task, training, policy, row)``, for one seed of the decoupled world models; those the
+    paper has no cell for are left out."""
     cells = {}
     for path in sorted(results.glob("*.json")):
         result = read_json(path)
         if (
             "world_model" not in result
             or not paper_numbers(result)
-            or result["settings"].get("world_model_seed")
+            or result["settings"].get("world_model_seed", 0) != world_model_seed
         ):
             continue
         training = "decoupled" if result["world_model"]["training"] == "decoupled" else "joint"
@@ -78,10 +79,14 @@ def markdown_table(results: Path, table: str) -> str:
 
 
 def print_tables(results: Path, form: str) -> None:
-    """Print all three as ``markdown`` or ``json``; ``ValueError`` for another form."""
+    """Print all three as ``markdown`` or ``json``, or the ``findings``; ``ValueError`` for another form."""
+    from .findings import markdown_findings
+
     if form == "json":
         print(json.dumps(table_rows(results), indent=1))
+    elif form == "findings":
+        print(markdown_findings(results))
     elif form == "markdown":
         print("\n\n".join(f"Table {table}\n\n{markdown_table(results, table)}" for table in COLUMNS))
     else:
-        raise ValueError(f"--print is markdown or json, not {form!r}")
+        raise ValueError(f"--print is markdown, json or findings, not {form!r}")

@@ -9,10 +9,12 @@ rows that were not asked for stay as they are.
 
 from __future__ import annotations
 
+import os
 import platform
 import sys
 from pathlib import Path
 
+os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")  # as recipes do; before torch is there
 import learning
 import loading
 import ppo

@@ -33,7 +33,15 @@ def test_gap_is_paired_and_has_an_interval():
     assert result["gap"] == pytest.approx(20.0)
     assert result["interval"][0] < 20 < result["interval"][1]
     same = success_gap([rows(5)], [rows(5)])
-    assert same == {"gap": 0.0, "interval": (0.0, 0.0)}
+    assert same == {"gap": 0.0, "interval": (0.0, 0.0), "p": 1.0}
+
+
+def test_p_is_that_of_a_sign_test_where_each_start_state_has_one_outcome():
+    """5 starts that only a solves against 1 that only b solves: 2 * (1 + 6) / 2**6 by hand."""
+    a = [dict(row, success=i < 5) for i, row in enumerate(rows(10))]
+    b = [dict(row, success=i == 5) for i, row in enumerate(rows(10))]
+    assert success_gap([a], [b])["p"] == pytest.approx(14 / 64)
+    assert success_gap([b], [a])["p"] == pytest.approx(14 / 64)
 
 
 def test_gap_refuses_other_start_states():

@@ -106,7 +106,7 @@ def test_a_cell_that_fails_says_where_to_look_and_the_others_go_on(tmp_path):
     ("arguments", "message"),
     [
         (["--only", "nothing"], "no cell's name holds"),
-        (["--print", "html"], "markdown or json"),
+        (["--print", "html"], "markdown, json or findings"),
         (["--launcher", "slurm"], "local or ray"),
     ],
 )

@@ -1,0 +1,92 @@
+"""Which of the paper's claims hold here: pairs of cells, compared on the start states that both share (Sec. V)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from .report import result_rows
+from .statistics import success_gap
+from .tables import ROWS, read_cells
+
+ONE, TWO, THREE = "balance_reaching", "balance_reaching_obstacle", "bin_dropping"
+DYNAMICS_ROWS = [row for row in ROWS if row.startswith("RGB+")]
+SEEDED = "Only-RGB", "RGB+[P]", "RGB+[V]", "RGB+[P+V]", "RGB+[P+V+A]"  # the rows that carry the claims
+
+Key = tuple[str, str, str, str]  # task, training, policy, row
+
+
+def list_pairs() -> Iterator[tuple[str, str, Key, Key]]:
+    """Claim, comparison, and the keys of the two cells of :func:`read_cells` that it compares."""
+    columns = [
+        ("task 1, feed-forward", (ONE, "decoupled", "feedforward")),
+        ("task 1, recurrent", (ONE, "decoupled", "recurrent")),
+        ("task 1, joint", (ONE, "joint", "recurrent")),
+    ]
+    for name, column in columns:
+        for row in DYNAMICS_ROWS:
+            yield "Dynamics beat Only-RGB", f"{name}: {row} - Only-RGB", (*column, row), (*column, "Only-RGB")
+    feedforward = columns[0][1]
+    for row in DYNAMICS_ROWS:
+        if "V" not in row:
+            pair = (*feedforward, "RGB+[V]"), (*feedforward, row)
+            yield "Velocity helps the feed-forward policy most", f"RGB+[V] - {row}", *pair
+    for row in ["Only-RGB", *DYNAMICS_ROWS]:
+        pair = (ONE, "decoupled", "recurrent", row), (*feedforward, row)
+        yield "Recurrent policies beat feed-forward ones", row, *pair
+    for row in ["Only-RGB", *DYNAMICS_ROWS]:
+        pair = (ONE, "decoupled", "recurrent", row), (ONE, "joint", "recurrent", row)
+        yield "Decoupled training beats joint training", row, *pair
+    for claim, task in (("Transfer holds on task 2", TWO), ("Transfer fails on task 3", THREE)):
+        for row in DYNAMICS_ROWS:
+            pair = (task, "decoupled", "recurrent", row), (task, "decoupled", "recurrent", "Only-RGB")
+            yield claim, f"{row} - Only-RGB", *pair
+
+
+def compare_cells(results: Path) -> list[dict]:
+    """A dict for every pair of which both cells are there: ``claim``, ``comparison``, ``SR`` of both (%), ``gap`` in
+    points with its 95 % bootstrap ``interval`` over the start states, and ``p`` of a paired permutation test."""
+    cells, rows = read_cells(results), []
+    for claim, comparison, a, b in list_pairs():
+        if a in cells and b in cells:
+            gap = success_gap(result_rows(cells[a]), result_rows(cells[b]))
+            rates = [cells[key]["test_protocol"]["SR"] for key in (a, b)]
+            rows.append({"claim": claim, "comparison": comparison, "SR": rates, **gap})
+    return rows
+
+
+def spread(results: Path) -> list[dict]:
+    """For every row with more than one world-model seed: ``row``, ``SR`` of each (%, decoupled, recurrent, task 1), their
+    ``mean`` and standard deviation ``std``."""
+    seeds, rows = [read_cells(results, seed) for seed in range(3)], []
+    for row in SEEDED:
+        found = [cells.get((ONE, "decoupled", "recurrent", row)) for cells in seeds]
+        rates = [result["test_protocol"]["SR"] for result in found if result]
+        if len(rates) > 1:
+            mean, std = float(np.mean(rates)), float(np.std(rates))
+            rows.append({"row": row, "SR": rates, "mean": mean, "std": std})
+    return rows
+
+
+def markdown_findings(results: Path) -> str:
+    """A table of the pairs under each claim, and the spread over world-model seeds."""
+    parts, rows = [], compare_cells(results)
+    for claim in dict.fromkeys(row["claim"] for row in rows):
+        lines = [f"**{claim}**", "", "| | SR | gap, points | p |", "|---|---|---|---|"]
+        for row in rows:
+            if row["claim"] == claim:
+                rates = " - ".join(f"{rate:.1f}" for rate in row["SR"])
+                low, high = row["interval"]
+                gap = f"{row['gap']:+.1f} [{low:.1f}, {high:.1f}]"
+                p = f"{row['p']:.3f}" if row["p"] >= 0.001 else "< 0.001"
+                lines.append(f"| {row['comparison']} | {rates} | {gap} | {p} |")
+        parts.append("\n".join(lines))
+    if seeded := spread(results):
+        lines = ["| three world models each | SR of each | mean (std) |", "|---|---|---|"]
+        for row in seeded:
+            rates = ", ".join(f"{rate:.1f}" for rate in row["SR"])
+            lines.append(f"| {row['row']} | {rates} | {row['mean']:.1f} ({row['std']:.1f}) |")
+        parts.append("\n".join(lines))
+    return "\n\n".join(parts)

@@ -1,0 +1,68 @@
+"""The paper's claims, tested on made-up results."""
+
+import json
+
+import pytest
+
+from dynmap_rl.evaluation.findings import compare_cells, list_pairs, markdown_findings, spread
+from dynmap_rl.evaluation.paper import TABLES
+
+TASK = "balance_reaching"
+
+
+def write(folder, row, successes, policy="recurrent", training="decoupled", task=TASK, seed=0, count=40):
+    flags = "".join("1" if i < successes else "0" for i in range(count))
+    rows = {
+        "first_scene_seed": 7,
+        "success": flags,
+        "dropped": "0" * count,
+        "touched": "0" * count,
+        "position_error": [0.01] * count,
+    }
+    result = {
+        "row": row,
+        "policy": policy,
+        "task": task,
+        "world_model": {"task": TASK, "training": training},
+        "settings": {"world_model_seed": seed},
+        "test_protocol": {"SR": 100 * successes / count},
+        "results": [{"test": {"rows": rows}}] * 3,
+    }
+    (folder / f"{task}_{training}_{row}_{policy}_{seed}.json").write_text(json.dumps(result))
+
+
+def test_every_pair_is_of_cells_that_the_paper_has_and_no_two_are_the_same():
+    pairs = list(list_pairs())
+    for _, _, *keys in pairs:
+        for *column, row in keys:
+            assert row in TABLES[tuple(column)]
+    assert len({(claim, comparison) for claim, comparison, *_ in pairs}) == len(pairs)
+
+
+def test_cells_that_are_there_are_compared_on_their_start_states(tmp_path):
+    write(tmp_path, "Only-RGB", 20)
+    write(tmp_path, "RGB+[V]", 38)
+    write(tmp_path, "RGB+[V]", 30, policy="feedforward")
+    found = {(row["claim"], row["comparison"]): row for row in compare_cells(tmp_path)}
+    assert set(found) == {
+        ("Dynamics beat Only-RGB", "task 1, recurrent: RGB+[V] - Only-RGB"),
+        ("Recurrent policies beat feed-forward ones", "RGB+[V]"),
+    }
+    better = found["Dynamics beat Only-RGB", "task 1, recurrent: RGB+[V] - Only-RGB"]
+    assert better["SR"] == [95.0, 50.0]
+    assert better["gap"] == pytest.approx(45.0)
+    assert better["interval"][0] > 20 and better["p"] < 0.001
+    text = markdown_findings(tmp_path)
+    assert "| task 1, recurrent: RGB+[V] - Only-RGB | 95.0 - 50.0 | +45.0 [" in text
+    assert "**Decoupled training beats joint training**" not in text
+
+
+def test_spread_is_over_the_seeds_of_the_world_model(tmp_path):
+    for seed, successes in enumerate((20, 30, 40)):
+        write(tmp_path, "Only-RGB", successes, seed=seed)
+    write(tmp_path, "RGB+[P]", 40)
+    assert compare_cells(tmp_path)[0]["SR"] == [100.0, 50.0]  # of the first seed
+    [row] = spread(tmp_path)
+    assert (row["row"], row["SR"], row["mean"]) == ("Only-RGB", [50.0, 75.0, 100.0], 75.0)
+    assert row["std"] == pytest.approx(20.4, abs=0.1)
+    assert "| Only-RGB | 50.0, 75.0, 100.0 | 75.0 (20.4) |" in markdown_findings(tmp_path)
