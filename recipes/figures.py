@@ -1,41 +1,195 @@
-"""Draw figures from datasets.
+"""Draw the paper's figures from our own runs, those of recipes/tables.py, and from the datasets.
 
-    python recipes/collect.py && python recipes/collect.py --task bin_dropping
     python recipes/figures.py
+    python recipes/figures.py --only fig2,fig7,distributions
 
-Draws how the angles and angular velocities of tasks are distributed, side by side, and writes their ranges as JSON.
+Fig. 2 to 4 show demonstrations, Fig. 6 and 9 what a world model of task 1 predicts on tasks 1 and 3, Fig. 7 policy
+losses, Fig. 8 closed-loop episodes; Fig. 1 and 5 are diagrams. ``distributions`` shows how the angles and angular
+velocities of the tasks are distributed, with their ranges as JSON. What a missing run leaves out is said.
 """
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from dynmap_rl.runs import run_recipe
 
+TASKS = {
+    "balance_reaching": "Task 1: Balance-Reaching",
+    "balance_reaching_obstacle": "Task 2: Balance-Reaching[v2]",
+    "bin_dropping": "Task 3: Bin-Dropping",
+}
+ONE, _, THREE = TASKS
+WORLD_MODEL = f"{ONE}_decoupled_position_velocity_acceleration_recurrent"  # of Fig. 6 and 9
+POLICIES = {  # of Fig. 8
+    "(a) Only-RGB, feedforward policy": f"{ONE}_decoupled_none_feedforward",
+    "(b) RGB+[P+V], recurrent policy": f"{ONE}_decoupled_position_velocity_recurrent",
+}
+
 
 @dataclass
 class Config:
-    # Datasets, folders or hub ids, separated by commas.
-    datasets: str = "datasets/balance_reaching,datasets/balance_reaching_obstacle,datasets/bin_dropping"
+    # Folder with the runs of recipes/tables.py.
+    runs: Path = Path("runs/tables")
     # Folder of the figures.
     output: Path = Path("runs/figures")
+    # Names of figures, separated by commas; by default all.
+    only: str = ""
+    # Datasets, folders or hub ids, separated by commas; by default datasets/TASK, recorded where it is not there.
+    datasets: str | None = None
 
 
 def main(config: Config) -> None:
-    from dynmap_rl.data import load_dataset, load_meta
+    names = [name.strip() for name in config.only.split(",")] if config.only else list(FIGURES)
+    if unknown := [name for name in names if name not in FIGURES]:
+        raise ValueError(f"--only: no figure {', '.join(unknown)}; choose from {', '.join(FIGURES)}")
+    datasets = name_datasets(config)
+    missing = []
+    for name in names:
+        try:
+            FIGURES[name](config, datasets)
+            print(f"written: {config.output / name}.png", flush=True)
+        except ValueError as error:
+            missing.append(f"{name}: {error}")
+    if missing:
+        raise ValueError("; ".join(missing))
+
+
+def name_datasets(config: Config) -> dict[str, str | Path]:
+    """Task to dataset: those of the settings, or datasets/TASK."""
+    from dynmap_rl.data import load_meta
+
+    if not config.datasets:
+        return {task: Path("datasets") / task for task in TASKS}
+    folders = [name.strip() for name in config.datasets.split(",")]
+    tasks = [load_meta(folder)["task"] for folder in folders]
+    if len(set(tasks)) < len(tasks):
+        raise ValueError(f"--datasets are of the tasks {', '.join(tasks)}; name one of each")
+    return dict(zip(tasks, folders, strict=True))
+
+
+def load_episodes(config: Config, datasets: dict, task: str, split: str = "eval"):
+    """Episodes ``[E, T]`` of a task's dataset, which is recorded where it is not there and none was asked for."""
+    from dynmap_rl.data import load_dataset, record_dataset
+
+    if task not in datasets:
+        raise ValueError(f"it needs a dataset of {task}; name one in --datasets")
+    if not config.datasets:
+        record_dataset(datasets[task], task)
+    return load_dataset(datasets[task], split)
+
+
+def is_done(run: Path) -> bool:
+    return (run / "eval.json").exists()
+
+
+def how_to_run(config: Config, cells: list[str]) -> str:
+    """The command for the first of the cells, after that for the cell whose world model it takes."""
+    source = cells[0].replace("feedforward", "recurrent")
+    todo = [cell for cell in dict.fromkeys((source, cells[0])) if not is_done(config.runs / cell)]
+    commands = " and then ".join(f"python recipes/tables.py --only {cell}" for cell in todo)
+    others = f" ({len(cells) - 1} more: python recipes/tables.py)" if len(cells) > 1 else ""
+    return f"no finished run {config.runs / cells[0]}; run {commands}{others}"
+
+
+def find_missing(config: Config, cells: list[str]) -> list[str]:
+    """Those of the cells that are not done, which is said; ``ValueError`` where that is all of them."""
+    missing = [cell for cell in cells if not is_done(config.runs / cell)]
+    if len(missing) == len(cells):
+        raise ValueError(how_to_run(config, missing))
+    if missing:
+        print(f"{len(cells) - len(missing)} of {len(cells)} runs are there: {how_to_run(config, missing)}")
+    return missing
+
+
+def draw_distributions(config: Config, datasets: dict) -> None:
     from dynmap_rl.evaluation.figures import plot_distributions
     from dynmap_rl.runs import command_line, write_json
 
-    names = [name.strip() for name in config.datasets.split(",")]
-    tasks = [load_meta(name)["task"] for name in names]
-    if len(set(tasks)) < len(tasks):
-        raise ValueError(f"--datasets are of the tasks {', '.join(tasks)}; name one of each")
-    dynamics = {
-        task: load_dataset(name, "train")["dynamics"] for task, name in zip(tasks, names, strict=True)
-    }
+    dynamics = {task: load_episodes(config, datasets, task, "train")["dynamics"] for task in datasets}
     ranges = plot_distributions(dynamics, config.output / "distributions.png")
+    names = [str(folder) for folder in datasets.values()]
     facts = {"command": command_line(), "datasets": names, "ranges": ranges}
     write_json(config.output / "distributions.json", facts)
-    print(f"written: {config.output}/distributions.png and .json")
+
+
+def draw_fig2(config: Config, datasets: dict) -> None:
+    """A demonstration over time."""
+    from dynmap_rl.data import load_meta
+    from dynmap_rl.evaluation.paper_figures import plot_trajectory, widest_ways
+
+    episode = widest_ways(load_episodes(config, datasets, ONE), 1)[0]
+    plot_trajectory(episode, load_meta(datasets[ONE])["normalization"], config.output / "fig2.png")
+
+
+def draw_fig3(config: Config, datasets: dict) -> None:
+    """A demonstration of each task."""
+    from dynmap_rl.evaluation.paper_figures import plot_film_strips, widest_ways
+
+    strips = {TASKS.get(t, t): widest_ways(load_episodes(config, datasets, t), 1)[0] for t in datasets}
+    plot_film_strips(strips, config.output / "fig3.png")
+
+
+def draw_fig4(config: Config, datasets: dict) -> None:
+    """Start states."""
+    from dynmap_rl.evaluation.paper_figures import plot_scenes
+
+    plot_scenes(load_episodes(config, datasets, ONE)["pixels"][:, 0], config.output / "fig4.png")
+
+
+def draw_prediction(config: Config, datasets: dict, task: str, name: str) -> None:
+    """What the world model of task 1 predicts on a task: Fig. 6 and 9."""
+    from dynmap_rl.evaluation.figures import plot_prediction
+    from dynmap_rl.evaluation.paper_figures import widest_ways
+    from dynmap_rl.modules import load_world_model
+
+    find_missing(config, [WORLD_MODEL])
+    world_model = load_world_model(config.runs / WORLD_MODEL / "world_model")
+    title = f"World model of task 1 (RGB+[P+V+A]) on held-out episodes of {TASKS[task]}"
+    episodes = widest_ways(load_episodes(config, datasets, task), 2)
+    plot_prediction(world_model, episodes, config.output / f"{name}.png", title)
+
+
+def draw_fig7(config: Config, datasets: dict) -> None:
+    """Policy losses, held-out ones and those of training."""
+    from dynmap_rl.evaluation.paper_figures import loss_panels, plot_losses
+
+    panels = loss_panels(ONE)
+    cells = dict.fromkeys(cell for groups in panels.values() for group in groups.values() for cell in group)
+    missing = find_missing(config, list(cells))
+    plot_losses(panels, config.runs, missing, config.output / "fig7.png")
+    plot_losses(panels, config.runs, missing, config.output / "fig7_training.png", held_out=False)
+    print(f"written: {config.output}/fig7_training.png")
+
+
+def draw_fig8(config: Config, datasets: dict) -> None:
+    """The paper's 50 test episodes of the first policy seed."""
+    from dynmap_rl.evaluation import SHARED_STARTS, roll_out, scene_seeds
+    from dynmap_rl.evaluation.paper_figures import plot_position_errors
+    from dynmap_rl.modules import Actor, load_policy, load_world_model
+    from dynmap_rl.runs import read_json
+
+    missing, panels = find_missing(config, list(POLICIES.values())), dict.fromkeys(POLICIES)
+    for title, cell in POLICIES.items():
+        if cell not in missing:
+            run = config.runs / cell
+            seed = read_json(run / "eval.json")["seeds"][0]
+            policy = load_policy(run / f"seed_{seed}" / "policy")
+            actor = Actor(load_world_model(run / "world_model"), policy, mixed=True)
+            panels[title] = roll_out(actor, ONE, scene_seeds("test", 50, start=SHARED_STARTS))
+    plot_position_errors(panels, config.output / "fig8.png")
+
+
+FIGURES = {
+    "fig2": draw_fig2,
+    "fig3": draw_fig3,
+    "fig4": draw_fig4,
+    "fig6": partial(draw_prediction, task=ONE, name="fig6"),
+    "fig7": draw_fig7,
+    "fig8": draw_fig8,
+    "fig9": partial(draw_prediction, task=THREE, name="fig9"),
+    "distributions": draw_distributions,
+}
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """Closed-loop rollouts, DR / PE / SR, statistics and figures."""
 
+from .imagination import open_loop_errors
 from .paper import TABLES, paper_numbers, parse_supervision, row_name
 from .report import SHARED_STARTS, evaluate, print_row, write_report
 from .rollout import episode_rows, roll_out, scene_seeds
@@ -10,6 +11,7 @@ __all__ = [
     "TABLES",
     "episode_rows",
     "evaluate",
+    "open_loop_errors",
     "paper_numbers",
     "parse_supervision",
     "print_row",

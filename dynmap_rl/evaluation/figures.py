@@ -74,7 +74,7 @@ def draw_reconstruction(figure, out: TensorDictBase, steps: list[list[int]]) -> 
             axes[2 * row, column].imshow(truth[t])
             axes[2 * row + 1, column].imshow(guess[t])
             if row == 0 or steps[row] != steps[row - 1]:
-                axes[2 * row, column].set_title(f"t = {t}", fontsize=9)
+                axes[2 * row, column].set_title(f"{t * CONTROL_DT:.2f} s", fontsize=9)
         axes[2 * row, 0].set_ylabel("true", fontsize=9)
         axes[2 * row + 1, 0].set_ylabel("predicted", fontsize=9)
     for axis in axes.flat:

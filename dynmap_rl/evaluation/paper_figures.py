@@ -9,6 +9,7 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
+import torch
 from tensordict import TensorDictBase
 
 from dynmap_rl.envs.tasks import SUCCESS_DISTANCE
@@ -57,7 +58,6 @@ def plot_trajectory(episode: TensorDictBase, constants: dict, path: Path) -> Non
             axis.tick_params(labelsize=7)
             axis.grid(alpha=0.3)
         axes[row, 0].set_ylabel("normalised", fontsize=8)
-    axes[0, 0].set_ylim(-1.1, 1.1)
     for axis in axes[-1]:
         axis.set_xlabel("time [s]", fontsize=8)
     save_figure(figure, path)
@@ -81,7 +81,7 @@ def _draw_strip(axes, episode: TensorDictBase) -> None:
         axis.set_xlabel(f"{t * CONTROL_DT:.2f} s", fontsize=8)
 
 
-def plot_scenes(frames, path: Path, columns: int = 8, rows: int = 4) -> None:
+def plot_scenes(frames: torch.Tensor, path: Path, columns: int = 8, rows: int = 4) -> None:
     """First frames uint8 ``[N, 3, 64, 64]`` of as many scenes as there are, in a grid (paper, Fig. 4)."""
     frames = frames[: rows * columns].permute(0, 2, 3, 1).numpy()
     rows = -(-len(frames) // columns)
@@ -165,10 +165,12 @@ def plot_losses(
         for number, (label, names) in enumerate(groups.items()):
             done = [runs / name for name in names if name not in missing]
             steps, losses = read_losses(done, held_out)
+            if not len(steps):
+                axis.plot([], [], f"C{number}", label=f"{label}: not run")
+                continue
             part = f" ({len(done)} of {len(names)} runs)" if len(done) < len(names) else ""
-            mean, deviation = losses.mean(0) if len(steps) else steps, losses.std(0) if len(steps) else steps
-            label += part if len(steps) else ": not run"
-            axis.plot(steps, mean, f"C{number}", lw=1.3, marker=".", ms=3, label=label)
+            mean, deviation = losses.mean(0), losses.std(0)
+            axis.plot(steps, mean, f"C{number}", lw=1.3, marker=".", ms=3, label=label + part)
             if len(groups) < 4:  # more bands hide each other
                 low, high = mean - deviation, mean + deviation
                 axis.fill_between(steps, low, high, color=f"C{number}", alpha=0.15, lw=0)
@@ -177,7 +179,7 @@ def plot_losses(
         axis.tick_params(which="both", labelsize=7, labelleft=True)
         axis.yaxis.set_major_formatter("{x:g}")
         axis.yaxis.set_minor_formatter("{x:g}")
-        axis.grid(alpha=0.3)
+        axis.grid(which="both", alpha=0.3)
         axis.legend(fontsize=7)
         if not any(len(line.get_xdata()) for line in axis.lines):
             _say_not_run(axis)
@@ -222,8 +224,10 @@ def draw_position_errors(axis, episodes: TensorDictBase) -> None:
             label = f"{labels.pop(end)} ({ends.count(end)})" if end in labels else None
             axis.plot(time, error[i], "tab:red" if end else "tab:blue", lw=0.9, alpha=0.7, label=label)
             if end:
-                t = int(dropped[i].int().argmax())
+                t = min(
+                    int(dropped[i].int().argmax()) + 1, len(time) - 1
+                )  # the flag is that of the next state
                 axis.plot(time[t], error[i, t], "o", color="tab:red", ms=3)
     axis.axhline(1000 * SUCCESS_DISTANCE, color="k", lw=1, ls="--", label="success: under 50 mm")
     axis.set_ylim(bottom=0)
-    axis.legend(fontsize=8)
+    axis.legend(fontsize=8, loc="upper right")

@@ -1,13 +1,72 @@
-"""The figures recipe, on a small dataset."""
+"""The figures recipe, on small datasets and on runs of untrained networks."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
 import pytest
+from PIL import Image
 
-from dynmap_rl.runs import read_json
-from recipes.figures import Config, main
+from dynmap_rl import data, evaluation
+from dynmap_rl.data import load_meta
+from dynmap_rl.evaluation import scene_seeds
+from dynmap_rl.evaluation.paper_figures import loss_panels
+from dynmap_rl.modules import make_policy, make_world_model, save_policy, save_world_model
+from dynmap_rl.runs import append_metrics, read_json, run_recipe, write_json
+from recipes.figures import POLICIES, WORLD_MODEL, Config, main
+from recipes.tables import list_cells
+
+RECIPE = Path(__file__).parents[2] / "recipes" / "figures.py"
+
+
+def is_drawn(path) -> bool:
+    """Whether a picture has more than a frame and its labels on white."""
+    with Image.open(path) as image:
+        pixels = np.asarray(image.convert("RGB"))
+    return len(np.unique(pixels.reshape(-1, 3), axis=0)) > 100
+
+
+def make_run(folder, constants, supervision, policy):
+    """What a finished run holds, but untrained."""
+    model = make_world_model(constants, supervision, latent_size=8, hidden_size=8)
+    save_world_model(folder / "world_model", model)
+    save_policy(folder / "seed_0" / "policy", make_policy(constants, policy, model, width=8), model)
+    append_metrics(folder / "seed_0", 100, loss=0.2, held_out_loss=0.1)
+    write_json(folder / "eval.json", {"seeds": [0]})
+
+
+@pytest.fixture(scope="module")
+def runs(recording, tmp_path_factory):
+    """A folder with the runs of Fig. 6, 8 and 9."""
+    folder, constants = tmp_path_factory.mktemp("runs"), load_meta(recording)["normalization"]
+    make_run(folder / WORLD_MODEL, constants, ("position", "velocity", "acceleration"), "recurrent")
+    without, with_dynamics = POLICIES.values()
+    make_run(folder / without, constants, (), "feedforward")
+    make_run(folder / with_dynamics, constants, ("position", "velocity"), "recurrent")
+    return folder
+
+
+@pytest.fixture
+def few_episodes(monkeypatch):
+    """Four closed-loop episodes in the place of fifty."""
+    monkeypatch.setattr(evaluation, "scene_seeds", lambda split, count, start: scene_seeds(split, 4, start))
+
+
+def test_draws_every_figure(runs, recordings, few_episodes, tmp_path, capsys):
+    datasets = ",".join(str(recordings(task)) for task in ("balance_reaching", "bin_dropping"))
+    main(Config(runs=runs, output=tmp_path, datasets=datasets))
+    names = {"distributions", "fig7_training", *(f"fig{number}" for number in (2, 3, 4, 6, 7, 8, 9))}
+    assert {path.stem for path in tmp_path.glob("*.png")} == names
+    text = capsys.readouterr().out
+    for name in names:
+        assert is_drawn(tmp_path / f"{name}.png"), name
+        assert f"written: {tmp_path}/{name}.png\n" in text
 
 
 def test_draws_the_distributions_and_writes_their_ranges(recording, tmp_path):
-    main(Config(datasets=str(recording), output=tmp_path / "figures"))
+    main(Config(only="distributions", datasets=str(recording), output=tmp_path / "figures"))
     assert (tmp_path / "figures/distributions.png").stat().st_size > 5000
     ranges = read_json(tmp_path / "figures/distributions.json")["ranges"]["balance_reaching"]
     assert set(ranges) == {"cart angle", "block angle", "cart angular velocity", "block angular velocity"}
@@ -20,3 +79,66 @@ def test_a_missing_dataset_is_named(tmp_path):
     with pytest.raises(ValueError, match="no dataset at datasets/nothing"):
         main(Config(datasets="datasets/nothing", output=tmp_path / "figures"))
     assert not (tmp_path / "figures").exists()
+
+
+def test_a_dataset_is_recorded_where_there_is_none(tmp_path, monkeypatch):
+    def record(root, task):
+        return whole(root, task, episodes=1, eval_episodes=1, workers=1)
+
+    whole = data.record_dataset
+    monkeypatch.setattr(data, "record_dataset", record, raising=False)
+    monkeypatch.chdir(tmp_path)
+    main(Config(only="fig4"))
+    assert is_drawn("runs/figures/fig4.png")
+    assert [path.name for path in Path("datasets").iterdir()] == ["balance_reaching"]
+
+
+def test_a_missing_run_is_named_after_the_other_figures(recording, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(
+        sys, "argv", ["figures.py", "--only", "fig6,fig7,fig8,fig4", "--datasets", str(recording)]
+    )
+    with pytest.raises(SystemExit) as stopped:
+        run_recipe(main, Config)
+    assert stopped.value.code == 2
+    result = capsys.readouterr()
+    assert result.out == "written: runs/figures/fig4.png\n"
+    assert len(result.err.splitlines()) == 1
+    assert f"fig6: no finished run runs/tables/{WORLD_MODEL}; " in result.err
+    assert f"run python recipes/tables.py --only {WORLD_MODEL};" in result.err
+    source = "balance_reaching_decoupled_none_recurrent"
+    both = f"--only {source} and then python recipes/tables.py --only {source.replace('recurrent', 'feedforward')} "
+    assert both in result.err, "a cell that takes a world model waits for it"
+    assert [path.name for path in (tmp_path / "runs/figures").iterdir()] == ["fig4.png"]
+
+
+def test_a_dataset_that_a_figure_lacks_is_named(runs, recording, tmp_path):
+    with pytest.raises(ValueError, match="fig9: it needs a dataset of bin_dropping"):
+        main(Config(runs=runs, output=tmp_path, only="fig9,fig6", datasets=str(recording)))
+    assert is_drawn(tmp_path / "fig6.png")
+
+
+def test_what_is_there_is_drawn(runs, few_episodes, tmp_path, capsys):
+    part = tmp_path / "runs"
+    cell = POLICIES["(b) RGB+[P+V], recurrent policy"]
+    part.mkdir()
+    (part / cell).symlink_to(runs / cell)
+    main(Config(runs=part, output=tmp_path, only="fig7,fig8"))
+    assert is_drawn(tmp_path / "fig7.png") and is_drawn(tmp_path / "fig8.png")
+    text = capsys.readouterr().out
+    assert "1 of 25 runs are there" in text and "1 of 2 runs are there" in text
+
+
+def test_an_unknown_figure_gets_one_clear_line(tmp_path):
+    command = [sys.executable, str(RECIPE), "--only", "fig2,fig5"]
+    result = subprocess.run(command, cwd=tmp_path, env=os.environ, capture_output=True, text=True)
+    assert result.returncode == 2
+    assert "no figure fig5; choose from fig2, fig3, " in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+    assert not (tmp_path / "runs").exists()
+
+
+def test_all_runs_are_cells_of_the_tables():
+    cells = {cell.name for cell in list_cells()}
+    groups = [names for panel in loss_panels("balance_reaching").values() for names in panel.values()]
+    assert {WORLD_MODEL, *POLICIES.values(), *(name for names in groups for name in names)} <= cells
