@@ -13,7 +13,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from dynmap_rl import data, modules, runs
-from dynmap_rl.evaluation import evaluate
+from dynmap_rl.evaluation import evaluate, policy_errors
 from dynmap_rl.modules import WorldModel
 from dynmap_rl.training import fingerprint, train_policy
 
@@ -68,12 +68,14 @@ def train_policies(
         device = runs.choose_device(settings.device)
         world_model.to(device)
         generator = torch.Generator(device).manual_seed(0)
-        features = data.compute_features(world_model, episodes["train"], settings.copies, generator)
+        recolor = settings.task != data.NO_TASK
+        features = data.compute_features(
+            world_model, episodes["train"], settings.copies, generator, recolor=recolor
+        )
         features.cpu().memmap(folder / "features" / "train")
         data.compute_features(world_model, episodes["eval"]).cpu().memmap(folder / "features" / "eval")
-        runs.run_processes(
-            _train_and_evaluate, [(settings, folder, constants, seed, frozen) for seed in todo]
-        )
+        arguments = [(settings, folder, constants, seed, frozen) for seed in todo]
+        runs.run_processes(_train_and_evaluate, arguments, settings.threads)
         shutil.rmtree(folder / "features")
     if fingerprint(modules.load_world_model(folder / "world_model")) != frozen:
         raise ValueError(f"the frozen world model of {folder} has changed; delete the folder and run again")
@@ -92,8 +94,11 @@ def _train_and_evaluate(arguments: tuple) -> None:
     held_out = TensorDict.load_memmap(folder / "features" / "eval")
     train_policy(policy, features, held_out, folder / f"seed_{seed}", settings, seed)
     modules.save_policy(folder / f"seed_{seed}" / "policy", policy, world_model)
-    episodes = settings.test_episodes, settings.paper_episodes
-    result = evaluate(world_model, policy, settings.task, *episodes, settings.split)
+    if settings.task == data.NO_TASK:
+        result = {"held_out": policy_errors(policy, held_out)}
+    else:
+        episodes = settings.test_episodes, settings.paper_episodes
+        result = evaluate(world_model, policy, settings.task, *episodes, settings.split)
     result["world_model_sha256"] = fingerprint(world_model)
     if result["world_model_sha256"] != frozen:
         raise ValueError("the frozen world model has changed; this run is not valid")

@@ -7,8 +7,9 @@ from pathlib import Path
 import torch
 
 from dynmap_rl import data, modules, runs
-from dynmap_rl.evaluation import evaluate
-from dynmap_rl.training import fingerprint, train_jointly
+from dynmap_rl.evaluation import evaluate, policy_errors
+from dynmap_rl.settings import load_episodes
+from dynmap_rl.training import fingerprint, prediction_errors, train_jointly
 
 
 def train_seeds(
@@ -34,25 +35,28 @@ def train_seeds(
         OSError: a process died.
     """
     todo = [seed for seed in seeds if not (folder / f"seed_{seed}" / "eval.json").exists()]
-    runs.run_processes(
-        _train_and_evaluate, [(dataset, supervision, folder, settings, seed, end_to_end) for seed in todo]
-    )
+    arguments = [(dataset, supervision, folder, settings, seed, end_to_end) for seed in todo]
+    runs.run_processes(_train_and_evaluate, arguments, settings.threads)
 
 
 def _train_and_evaluate(arguments: tuple) -> None:
     dataset, supervision, folder, settings, seed, end_to_end = arguments
     torch.set_num_threads(1)
     runs.seed_everything(2000 + seed)
-    constants = data.load_meta(dataset)["normalization"]
+    episodes, constants = load_episodes(settings, dataset)
     device = runs.choose_device(settings.device)
     world_model = modules.make_world_model(constants, supervision).to(device)
     policy = modules.make_policy(constants, settings.policy, world_model).to(device)
-    episodes = {split: data.load_dataset(dataset, split) for split in ("train", "eval")}
     folder = folder / f"seed_{seed}"
     train_jointly(world_model, policy, episodes, folder, settings, seed, end_to_end)
     world_model.eval(), policy.eval()
     modules.save_world_model(folder / "world_model", world_model)
     modules.save_policy(folder / "policy", policy, world_model)
-    sizes = settings.test_episodes, settings.paper_episodes
-    result = evaluate(world_model, policy, settings.task, *sizes, settings.split)
+    if settings.task == data.NO_TASK:
+        features = data.compute_features(world_model, episodes["eval"])
+        errors = prediction_errors(world_model, episodes["eval"], by_entry=True)
+        result = {"held_out": errors | policy_errors(policy, features)}
+    else:
+        sizes = settings.test_episodes, settings.paper_episodes
+        result = evaluate(world_model, policy, settings.task, *sizes, settings.split)
     runs.write_json(folder / "eval.json", result | {"world_model_sha256": fingerprint(world_model)})

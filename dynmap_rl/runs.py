@@ -206,19 +206,19 @@ def command_line() -> str:
     return " ".join(["python", f"recipes/{Path(sys.argv[0]).name}", *sys.argv[1:]])
 
 
-def run_processes(work: Callable[[tuple], None], arguments: list[tuple]) -> None:
-    """Two at a time, each in a process of its own; one alone in this one.
+def run_processes(work: Callable[[tuple], None], arguments: list[tuple], count: int) -> None:
+    """``count`` at a time, each in a process of its own; one at a time, or one alone, in this one.
 
     Raises:
         OSError: a process died.
     """
-    if len(arguments) <= 1:
+    if min(count, len(arguments)) <= 1:
         for one in arguments:
             work(one)
         return
     context = multiprocessing.get_context("spawn")
     try:
-        with ProcessPoolExecutor(2, mp_context=context, initializer=start_worker) as pool:
+        with ProcessPoolExecutor(count, mp_context=context, initializer=start_worker) as pool:
             list(pool.map(work, arguments))
     except BrokenProcessPool as error:
         raise OSError("a process died (of memory?); the same command goes on") from error

@@ -4,10 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from tensordict import TensorDictBase
+
 from dynmap_rl import data, modules, runs
+from dynmap_rl.data import NO_TASK
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.world import EPISODE_STEPS
-from dynmap_rl.evaluation import SHARED_STARTS
+from dynmap_rl.evaluation import SHARED_STARTS, parse_supervision
+
+# What replaces defaults where a dataset is of no task of ours. The weights of changed actions suppose that actions are
+# changes and begin at rest, the bars a background of one colour.
+FOREIGN = {"emphasis": 0.0, "distractors": 0}
 
 
 def check_settings(settings) -> list[int]:
@@ -15,7 +22,8 @@ def check_settings(settings) -> list[int]:
 
     Args:
         settings: with ``task``, ``device``, ``policy``, ``seeds``, ``dataset``, ``split``, ``test_episodes``, ``paper_episodes``
-            and, where there are any, ``updates``, ``policy_updates`` and ``window_steps``.
+            and, where there are any, ``updates``, ``policy_updates`` and ``window_steps``. Where it has ``camera``,
+            ``goal`` and ``supervision`` too, its task may be none.
 
     Returns:
         The seeds of the policies.
@@ -23,7 +31,9 @@ def check_settings(settings) -> list[int]:
     Raises:
         ValueError: a setting is wrong; the message says which.
     """
-    get_task(settings.task)
+    foreign = settings.task == NO_TASK and hasattr(settings, "camera")
+    if not foreign:
+        get_task(settings.task)
     runs.choose_device(settings.device)
     modules.check_policy(settings.policy)
     try:
@@ -41,7 +51,16 @@ def check_settings(settings) -> list[int]:
             raise ValueError(f"--{name} must be at least 1, not {value}")
     if not 2 <= (steps := getattr(settings, "window_steps", 2)) <= EPISODE_STEPS:
         raise ValueError(f"--window_steps must be 2 to {EPISODE_STEPS}, not {steps}")
-    if settings.dataset and (task := data.load_meta(settings.dataset)["task"]) != settings.task:
+    if foreign:
+        if not settings.dataset:
+            raise ValueError("--task none needs a --dataset: a folder or a hub id")
+        supervision = parse_supervision(settings.supervision)
+        data.describe_foreign(settings.dataset, settings.camera, settings.goal, supervision)
+    elif getattr(settings, "camera", None) or getattr(settings, "goal", None):
+        raise ValueError(
+            "--camera and --goal are for --task none; our own tasks have one camera and their goal"
+        )
+    elif settings.dataset and (task := data.load_meta(settings.dataset)["task"]) != settings.task:
         raise ValueError(f"{settings.dataset} holds the task {task}, not {settings.task}")
     return seeds
 
@@ -55,3 +74,23 @@ def find_or_record(settings) -> str | Path:
         folder = folder.with_name(f"{folder.name}_smoke")
         return data.record_dataset(folder, settings.task, episodes=4, eval_episodes=2, workers=1)
     return data.record_dataset(folder, settings.task)
+
+
+def load_episodes(settings, dataset: str | Path) -> tuple[dict[str, TensorDictBase], dict]:
+    """The splits ``train`` and ``eval`` of the settings' dataset, and its constants of normalisation."""
+    if settings.task == NO_TASK:
+        episodes = data.load_foreign(dataset, settings.window_steps, settings.camera, settings.goal)
+        return episodes, data.range_constants(episodes["train"])
+    episodes = {split: data.load_dataset(dataset, split) for split in ("train", "eval")}
+    return episodes, data.load_meta(dataset)["normalization"]
+
+
+def name_task(settings) -> str:
+    """What a run's folder is named after: the task, or the dataset that is of none."""
+    return Path(settings.dataset).name if settings.task == NO_TASK else get_task(settings.task).name
+
+
+def describe_source(settings, training: str) -> dict[str, str]:
+    """Where a world model of this run is from."""
+    source = {"task": settings.task, "training": training}
+    return source | ({"dataset": settings.dataset} if settings.task == NO_TASK else {})

@@ -13,12 +13,12 @@ from torch import nn
 from tqdm import tqdm
 
 from dynmap_rl import runs
-from dynmap_rl.data import add_distractors, augment, compute_features, sample_windows
+from dynmap_rl.data import NO_TASK, add_distractors, augment, compute_features, sample_windows
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.modules import WorldModel, mixed_precision
-from dynmap_rl.objectives import JointLoss, WorldModelLoss, imitation_loss
+from dynmap_rl.objectives import ImitationLoss, JointLoss, WorldModelLoss
 
-STATES = ("latent", "hidden1", "hidden2")
+GROUPS = {"": [0, 1, 3, 4], "_angle": [2, 5]}  # entries of our tasks' dynamics that have one unit
 
 
 def train_world_model(
@@ -35,14 +35,15 @@ def train_world_model(
         episodes: ``train`` and ``eval``, ``[E, T]``.
         folder: run folder; gets ``metrics.jsonl`` and the training state.
         settings: with ``updates``, ``windows``, ``window_steps``, ``rgb_steps``, ``distractors``,
-            ``learning_rate``, ``beta_z``, ``beta_dynamics`` and ``world_model_seed``.
+            ``learning_rate``, ``beta_z``, ``beta_dynamics`` and ``world_model_seed``. Windows are as they are where its
+            ``task`` is none: what may be changed in the frames of others is not known.
 
     Raises:
         ValueError: a loss is not finite.
     """
 
     def held_out() -> dict[str, float]:
-        return prediction_errors(world_model, episodes["eval"])
+        return prediction_errors(world_model, episodes["eval"], by_entry=_has_no_task(settings))
 
     loss_module = _make_loss(world_model, settings)
     _fit(
@@ -87,12 +88,18 @@ def train_jointly(
         )
 
     def held_out() -> dict[str, float]:
-        errors = {} if end_to_end else prediction_errors(world_model, episodes["eval"])
+        errors = {}
+        if not end_to_end:
+            errors = prediction_errors(world_model, episodes["eval"], by_entry=_has_no_task(settings))
         return errors | {"held_out_loss": policy_error(world_model, policy, episodes["eval"])}
 
-    symmetric = get_task(settings.task).symmetric
+    symmetric = not _has_no_task(settings) and get_task(settings.task).symmetric
     limits = {} if symmetric else {"max_shift": 0, "mirror": False}
     _fit(model, loss_module, episodes["train"], held_out, folder, settings, seed, save_every, limits)
+
+
+def _has_no_task(settings) -> bool:
+    return getattr(settings, "task", None) == NO_TASK
 
 
 def _make_loss(world_model: WorldModel, settings) -> WorldModelLoss:
@@ -128,9 +135,9 @@ def _fit(
     for update in progress:
         set_learning_rate(optimizer, settings.learning_rate, update, settings.updates)
         windows = sample_windows(episodes, settings.windows, settings.window_steps, generator)
-        windows = add_distractors(
-            augment(windows, generator, **limits or {}), generator, settings.distractors
-        )
+        if not _has_no_task(settings):
+            windows = augment(windows, generator, **limits or {})
+        windows = add_distractors(windows, generator, settings.distractors)
         with mixed_precision(device):
             losses = loss_module(windows)
         step(sum(losses.values()), optimizer)
@@ -167,32 +174,31 @@ def train_policy(
     device = next(policy.parameters()).device
     features, held_out = features.to(device), held_out.to(device)
     generator = torch.Generator(device).manual_seed(seed)
-    keys = [*STATES, "goal"]
+    loss_module, plain = ImitationLoss(policy, settings.emphasis), ImitationLoss(policy)
     progress = tqdm(range(settings.policy_updates), f"policy {seed}", position=seed)
     for update in progress:
         set_learning_rate(optimizer, settings.policy_learning_rate, update, settings.policy_updates)
         index = torch.randint(len(features), (settings.policy_batch,), generator=generator, device=device)
         batch = features[index]
         with mixed_precision(device):
-            predicted = policy(*(batch[k] for k in keys))
-        ignore = batch["disturbed"]
-        loss = imitation_loss(predicted, batch["action"], policy.action, ignore, settings.emphasis)
+            loss = loss_module(batch)["loss_policy"]
         step(loss, optimizer)
         done = update + 1
         if done % 100 == 0 or done == settings.policy_updates:
             with torch.no_grad():
-                predicted = policy(*(held_out[k] for k in keys))
-                ignore = held_out["disturbed"]
-                validation = imitation_loss(predicted, held_out["action"], policy.action, ignore)
+                validation = plain(held_out)["loss_policy"]
             loss = check_finite(loss)
             runs.append_metrics(folder, done, loss=loss, held_out_loss=validation)
             progress.set_postfix(loss=f"{loss:.4f}", held_out=f"{validation:.4f}")
 
 
 @torch.no_grad()
-def prediction_errors(world_model: WorldModel, episodes: TensorDictBase, batch: int = 10) -> dict[str, float]:
+def prediction_errors(
+    world_model: WorldModel, episodes: TensorDictBase, batch: int = 10, by_entry: bool = False
+) -> dict[str, float]:
     """One-step prediction errors on episodes ``[E, T]``: the frames' root mean square (0..1), and the mean absolute
-    error of each decoded quantity's x and y (m, m/s, m/s^2) and of its angles (``_angle``: rad, rad/s, rad/s^2)."""
+    error of each decoded quantity's x and y (m, m/s, m/s^2) and of its angles (``_angle``: rad, rad/s, rad/s^2), or,
+    ``by_entry``, of each of its entries (``_0``, ``_1``, ...)."""
     sums: dict[str, float] = {}
     device = next(world_model.parameters()).device
     for chunk in episodes.split(batch):
@@ -203,8 +209,9 @@ def prediction_errors(world_model: WorldModel, episodes: TensorDictBase, batch: 
         errors = {"rgb": error.square().flatten(2).mean(-1).sqrt().mean()}
         for name, value in world_model.decode_dynamics(*states).items():
             difference = (value - chunk["dynamics", name])[:, 1:].abs()
-            errors[name] = difference[..., [0, 1, 3, 4]].mean()
-            errors[f"{name}_angle"] = difference[..., [2, 5]].mean()
+            groups = {f"_{i}": [i] for i in range(difference.shape[-1])} if by_entry else GROUPS
+            for group, entries in groups.items():
+                errors[f"{name}{group}"] = difference[..., entries].mean()
         for name, value in errors.items():
             sums[f"error_{name}"] = sums.get(f"error_{name}", 0.0) + value.item() * len(chunk) / len(episodes)
     return sums
@@ -213,9 +220,7 @@ def prediction_errors(world_model: WorldModel, episodes: TensorDictBase, batch: 
 @torch.no_grad()
 def policy_error(world_model: WorldModel, policy: nn.Module, episodes: TensorDictBase) -> float:
     """The plain L1 loss of a policy on episodes ``[E, T]``."""
-    states = compute_features(world_model, episodes)
-    predicted = policy(*(states[k] for k in (*STATES, "goal")))
-    return imitation_loss(predicted, states["action"], policy.action, states["disturbed"]).item()
+    return ImitationLoss(policy)(compute_features(world_model, episodes))["loss_policy"].item()
 
 
 def fingerprint(module: nn.Module) -> str:

@@ -3,6 +3,7 @@
     python recipes/decoupled.py                                       # RGB+[P+V], recurrent policy
     python recipes/decoupled.py --supervision none --policy feedforward
     python recipes/decoupled.py --task bin_dropping
+    python recipes/decoupled.py --task none --dataset datasets/mine   # a robot's dataset with dynamics columns
 
 With no option it records the demonstrations with the shipped expert first. The same command on the same run folder
 goes on where it was stopped, or says that it is done.
@@ -16,7 +17,8 @@ from dynmap_rl.runs import run_recipe
 
 @dataclass
 class Config:
-    # Name of the task: balance_reaching, balance_reaching_obstacle, bin_dropping, or module:Class of your own.
+    # Name of the task: balance_reaching, balance_reaching_obstacle, bin_dropping, module:Class of your own, or
+    # none for a LeRobot dataset of any other task (--dataset; see README, "Your own robot's dataset").
     task: str = "balance_reaching"
     # Which dynamics the world model is supervised on: any of position,velocity,acceleration, or none (Only-RGB).
     supervision: str = "position,velocity"
@@ -27,6 +29,10 @@ class Config:
     world_model_seed: int = 0
     # Dataset: a folder or a hub id; by default datasets/TASK, recorded if it is not there.
     dataset: str | None = None
+    # With --task none: the camera's column, by default the first, and the goal's column and entries, such as
+    # observation.state:3,4, by default no goal.
+    camera: str | None = None
+    goal: str | None = None
     # Run folder; by default runs/decoupled/TASK/SUPERVISION_POLICY.
     run: Path | None = None
     # Run folder whose world model is taken, of the same task and supervision; by default one is trained here.
@@ -59,6 +65,7 @@ class Config:
     smoke: bool = False
     # cpu, cuda, or auto: the GPU where there is one.
     device: str = "auto"
+    # Cores: threads of the world model's training, then policies trained at a time.
     threads: int = 2
 
 
@@ -72,24 +79,25 @@ def main(config: Config) -> None:
     import torch
 
     from dynmap_rl import data, frozen, modules, runs, settings
-    from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.evaluation import parse_supervision, print_row, write_report
     from dynmap_rl.training import train_world_model
 
     if config.smoke:
         runs.replace_defaults(config, SMOKE)
+    if config.task == data.NO_TASK:
+        runs.replace_defaults(config, settings.FOREIGN)
     supervision = parse_supervision(config.supervision)
     seeds = settings.check_settings(config)
     trained = None
     if config.world_model:
         trained, source = frozen.load_source(config.world_model)
-        if source != {"task": config.task, "training": "decoupled"} or trained.supervision != supervision:
+        if source != settings.describe_source(config, "decoupled") or trained.supervision != supervision:
             raise ValueError(
-                f"{config.world_model} is a world model of {source['task']}, {source['training']}, supervised on "
+                f"{config.world_model} is a world model of {source.get('dataset', source['task'])}, {source['training']}, supervised on "
                 f"{trained.supervision}; for another task use recipes/generalize.py"
             )
     name = f"{'_'.join(supervision) or 'none'}_{config.policy}{'_smoke' if config.smoke else ''}"
-    folder = config.run or Path("runs/decoupled") / get_task(config.task).name / name
+    folder = config.run or Path("runs/decoupled") / settings.name_task(config) / name
     folder = runs.open_run(folder, config, ignore=("run", "threads", "device"))
     if (folder / "eval.json").exists():
         print(f"{folder} is done; delete it to run again")
@@ -97,8 +105,7 @@ def main(config: Config) -> None:
     torch.set_num_threads(config.threads)
 
     dataset = settings.find_or_record(config)
-    constants = data.load_meta(dataset)["normalization"]
-    episodes = {split: data.load_dataset(dataset, split) for split in ("train", "eval")}
+    episodes, constants = settings.load_episodes(config, dataset)
 
     world_model = trained
     if world_model is None:
@@ -109,7 +116,7 @@ def main(config: Config) -> None:
     fingerprint = frozen.train_policies(world_model, episodes, constants, folder, config, seeds)
     result = write_report(folder, config, dataset, world_model, episodes["eval"], seeds, fingerprint)
     print_row(result)
-    print(f"figures, rollouts and eval.json are in {folder}")
+    print(f"eval.json and all else is in {folder}")
 
 
 if __name__ == "__main__":

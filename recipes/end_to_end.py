@@ -44,6 +44,8 @@ class Config:
     smoke: bool = False
     # cpu, cuda, or auto: the GPU where there is one.
     device: str = "auto"
+    # Seeds trained at a time, each on one core.
+    threads: int = 2
 
 
 SMOKE = {
@@ -61,7 +63,7 @@ def main(config: Config) -> None:
     seeds = settings.check_settings(config)
     name = f"{config.policy}{'_smoke' if config.smoke else ''}"
     folder = config.run or Path("runs/end_to_end") / get_task(config.task).name / name
-    folder = runs.open_run(folder, config, ignore=("run", "device"))
+    folder = runs.open_run(folder, config, ignore=("run", "threads", "device"))
     if (folder / "eval.json").exists():
         print(f"{folder} is done; delete it to run again")
         return print_row(runs.read_json(folder / "eval.json"))

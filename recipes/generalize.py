@@ -44,6 +44,7 @@ class Config:
     smoke: bool = False
     # cpu, cuda, or auto: the GPU where there is one.
     device: str = "auto"
+    # Policies trained at a time, each on one core.
     threads: int = 2
 
 

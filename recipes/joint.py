@@ -16,7 +16,8 @@ from dynmap_rl.runs import run_recipe
 
 @dataclass
 class Config:
-    # Name of the task: balance_reaching, balance_reaching_obstacle, bin_dropping, or module:Class of your own.
+    # Name of the task: balance_reaching, balance_reaching_obstacle, bin_dropping, module:Class of your own, or
+    # none for a LeRobot dataset of any other task (--dataset; see README, "Your own robot's dataset").
     task: str = "balance_reaching"
     # Which dynamics the world model is supervised on: any of position,velocity,acceleration, or none (Only-RGB).
     supervision: str = "position,velocity"
@@ -26,6 +27,10 @@ class Config:
     seeds: str = "0,1,2"
     # Dataset: a folder or a hub id; by default datasets/TASK, recorded if it is not there.
     dataset: str | None = None
+    # With --task none: the camera's column, by default the first, and the goal's column and entries, such as
+    # observation.state:3,4, by default no goal.
+    camera: str | None = None
+    goal: str | None = None
     # Run folder; by default runs/joint/TASK/SUPERVISION_POLICY.
     run: Path | None = None
     # Optimiser steps, windows a step, steps a window, decoded frames a window, peak learning rate.
@@ -51,6 +56,8 @@ class Config:
     smoke: bool = False
     # cpu, cuda, or auto: the GPU where there is one.
     device: str = "auto"
+    # Seeds trained at a time, each on one core.
+    threads: int = 2
 
 
 SMOKE = {
@@ -60,16 +67,17 @@ SMOKE = {
 
 def main(config: Config) -> None:
     from dynmap_rl import data, joint, modules, runs, settings
-    from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.evaluation import parse_supervision, print_row, write_report
 
     if config.smoke:
         runs.replace_defaults(config, SMOKE)
+    if config.task == data.NO_TASK:
+        runs.replace_defaults(config, settings.FOREIGN)
     supervision = parse_supervision(config.supervision)
     seeds = settings.check_settings(config)
     name = f"{'_'.join(supervision) or 'none'}_{config.policy}{'_smoke' if config.smoke else ''}"
-    folder = config.run or Path("runs/joint") / get_task(config.task).name / name
-    folder = runs.open_run(folder, config, ignore=("run", "device"))
+    folder = config.run or Path("runs/joint") / settings.name_task(config) / name
+    folder = runs.open_run(folder, config, ignore=("run", "threads", "device"))
     if (folder / "eval.json").exists():
         print(f"{folder} is done; delete it to run again")
         return print_row(runs.read_json(folder / "eval.json"))
@@ -78,11 +86,11 @@ def main(config: Config) -> None:
     joint.train_seeds(dataset, supervision, folder, config, seeds)
     world_model = modules.load_world_model(folder / f"seed_{seeds[0]}" / "world_model")
     modules.save_world_model(folder / "world_model", world_model)
-    source = {"task": config.task, "training": "joint"}
-    held_out = data.load_dataset(dataset, "eval")
-    result = write_report(folder, config, dataset, world_model, held_out, seeds, source=source)
+    source = settings.describe_source(config, "joint")
+    episodes, _ = settings.load_episodes(config, dataset)
+    result = write_report(folder, config, dataset, world_model, episodes["eval"], seeds, source=source)
     print_row(result)
-    print(f"figures, rollouts and eval.json are in {folder}")
+    print(f"eval.json and all else is in {folder}")
 
 
 if __name__ == "__main__":

@@ -36,7 +36,7 @@ class Config:
     runs: Path = Path("runs/tables")
     # Only cells whose name holds this.
     only: str = ""
-    # Cells at a time on this machine; each trains its policies in two processes.
+    # Cells at a time on this machine; each takes two cores if it is alone, otherwise one.
     workers: int = 1
     # local, or ray: the cluster that RAY_ADDRESS names, or one on this machine. Its machines share this folder.
     launcher: str = "local"
@@ -113,8 +113,7 @@ def run_cell(cell: Cell, config: Config, root: Path) -> str | None:
     command = [sys.executable, str(RECIPES / f"{cell.recipe}.py"), *cell.arguments, "--run", str(folder)]
     if cell.needs:
         command += ["--world_model", str(config.runs / cell.needs)]
-    if cell.recipe == "decoupled" and config.workers > 1:
-        command += ["--threads", "1"]
+    command += ["--threads", "1"] if config.workers > 1 else []
     command += ["--smoke"] if config.smoke else []
     log.parent.mkdir(parents=True, exist_ok=True)
     with open(log, "a") as file:

@@ -57,7 +57,16 @@ def test_every_option_and_file_that_the_readme_names_exists():
     options = set(re.findall(r"--(\w+)", " ".join(re.findall(r"recipes/\w+\.py.*", README))))
     known = "".join(
         (ROOT / "recipes" / f"{name}.py").read_text()
-        for name in ("decoupled", "joint", "generalize", "collect", "expert", "evaluate", "tables")
+        for name in (
+            "decoupled",
+            "joint",
+            "generalize",
+            "collect",
+            "expert",
+            "evaluate",
+            "tables",
+            "add_dynamics",
+        )
     )
     for option in options:
         assert re.search(rf"^    {option}: ", known, re.M), option

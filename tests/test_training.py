@@ -101,7 +101,7 @@ def test_a_frozen_world_model_that_changes_stops_the_run(tmp_path, monkeypatch, 
     """One weight, on the disk, after the policy of a seed is finished: the first, or the last."""
     weights = tmp_path / "world_model/weights.safetensors"
 
-    def work_and_tamper(work, arguments):
+    def work_and_tamper(work, arguments, count):
         for number, one in enumerate(arguments):
             work(one)
             if number == seed:
@@ -110,7 +110,7 @@ def test_a_frozen_world_model_that_changes_stops_the_run(tmp_path, monkeypatch, 
                 save_file(state, weights)
 
     monkeypatch.setattr(runs, "run_processes", work_and_tamper)
-    sizes = {"copies": 1, "test_episodes": 1, "paper_episodes": 1, "split": "validation"}
+    sizes = {"copies": 1, "test_episodes": 1, "paper_episodes": 1, "split": "validation", "threads": 1}
     settings = SimpleNamespace(task="balance_reaching", policy="feedforward", **sizes, **vars(SETTINGS))
     episodes = dict.fromkeys(("train", "eval"), make_episodes())
     with pytest.raises(ValueError, match=message):

@@ -3,14 +3,22 @@
 import importlib
 
 _MODULES = {
+    "NO_TASK": "foreign",
     "add_distractors": "augmentation",
+    "as_replay_buffer": "replay",
+    "add_dynamics": "dynamics",
     "augment": "augmentation",
     "compute_features": "features",
+    "describe_foreign": "foreign",
+    "differentiate": "dynamics",
     "find_dataset": "loading",
     "load_dataset": "loading",
+    "load_foreign": "foreign",
     "load_meta": "loading",
     "normalization_constants": "recording",
+    "parse_entries": "dynamics",
     "push_dataset": "writing",
+    "range_constants": "foreign",
     "record_dataset": "recording",
     "sample_windows": "augmentation",
 }

@@ -18,6 +18,7 @@ def compute_features(
     copies: int = 0,
     generator: torch.Generator | None = None,
     batch: int = 10,
+    recolor: bool = True,
 ) -> TensorDict:
     """Latents and hidden states of whole episodes, with the actions and goals that go with them.
 
@@ -26,6 +27,7 @@ def compute_features(
         episodes: ``[E, T]`` with ``pixels``, ``action``, ``goal``, ``dynamics``.
         copies: so many recoloured versions of every episode follow the plain ones, each from a random step on.
         generator: of the copies.
+        recolor: false where colours have a meaning, and labels are not those of our tasks.
 
     Returns:
         ``[(1 + copies) E, T]`` with ``latent``, ``hidden1``, ``hidden2``, ``action``, ``goal`` and ``disturbed``: the
@@ -40,8 +42,9 @@ def compute_features(
             chunk = chunk.to(device)
             if copy:
                 chunk = _start_anywhere(chunk, generator)
-                # Neither shifted nor mirrored: an obstacle has its place, and an expert may prefer one side.
-                chunk = augment(chunk, generator, max_shift=0, mirror=False)
+                if recolor:
+                    # Neither shifted nor mirrored: an obstacle has its place, and an expert may prefer one side.
+                    chunk = augment(chunk, generator, max_shift=0, mirror=False)
             latent = world_model.encode(chunk["pixels"], mixed=True)
             _, hidden1, hidden2 = world_model.predict(latent, chunk["action"])
             features = {"latent": latent, "hidden1": hidden1, "hidden2": hidden2}

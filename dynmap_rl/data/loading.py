@@ -77,7 +77,7 @@ def load_meta(dataset: str | Path) -> dict:
         _read_info(root)
         raise ValueError(
             f"{dataset} has no {META}, with scenes and normalisation: it is a LeRobot dataset that "
-            "recipes/collect.py did not record; record one, or compute normalization_constants yourself"
+            "recipes/collect.py did not record; record one, or train on this one with --task none"
         )
     return _read_json(root / META)
 
@@ -182,13 +182,13 @@ def _episodes_and_steps(root: Path, table: pa.Table) -> tuple[int, int]:
     return len(lengths), int(lengths[0])
 
 
-def _read_column(root: Path, name: str, column: pa.ChunkedArray) -> torch.Tensor:
+def _read_column(root: Path, name: str, column: pa.ChunkedArray, dtype=np.float32) -> torch.Tensor:
     """The column's numbers, one after the other, as memory of their own."""
     flat = column.combine_chunks()
     while pa.types.is_list(flat.type) or pa.types.is_fixed_size_list(flat.type):
         flat = flat.flatten()
     values = flat.to_numpy(zero_copy_only=False)
-    values = values.astype(bool if values.dtype == bool else np.float32)
+    values = values.astype(bool if values.dtype == bool else dtype)
     if column.null_count or not np.isfinite(values).all():
         raise ValueError(f"{root} has numbers in {name} that are missing or not finite; record it again")
     return torch.from_numpy(values)

@@ -1,18 +1,21 @@
-"""Worlds, tasks and their adapters: Gymnasium ids and one batched TorchRL environment."""
+"""Worlds, tasks and their adapters: Gymnasium ids, one batched TorchRL environment, and the world model in TorchRL."""
+
+import importlib
 
 from .scene import Scene, SceneRanges, sample_scene, scene_seed
 from .world import World
 
-__all__ = ["DynmapBatchedEnv", "DynmapEnv", "Scene", "SceneRanges", "World", "sample_scene", "scene_seed"]
+_MODULES = {
+    "DynmapBatchedEnv": "torchrl_env",
+    "DynmapEnv": "gymnasium_env",
+    "ImaginationEnv": "imagination",
+    "WorldModelTransform": "transforms",
+    "make_start": "imagination",
+}
+__all__ = [*_MODULES, "Scene", "SceneRanges", "World", "sample_scene", "scene_seed"]
 
 
 def __getattr__(name: str):
-    if name == "DynmapBatchedEnv":
-        from .torchrl_env import DynmapBatchedEnv
-
-        return DynmapBatchedEnv
-    if name == "DynmapEnv":
-        from .gymnasium_env import DynmapEnv
-
-        return DynmapEnv
+    if name in _MODULES:
+        return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from .renderer import Renderer
+from .renderer import Renderer, Window
 from .scene import SceneRanges
 from .tasks import choose_ranges, get_task
 from .world import ACCELERATION_LIMIT, CONTROL_DT, EPISODE_STEPS, VELOCITY_LIMIT
@@ -29,7 +29,9 @@ class DynmapEnv(gym.Env):
         ``control="position"``: float32 ``(3,)``, the change dX, dY, dTheta of the commanded cart pose in one step,
         at most 20 mm, 20 mm, 50 mrad (0.4 m/s, 1 rad/s). ``control="acceleration"``: float32 ``(3,)``, the cart's
         acceleration, at most 3 m/s^2, 3 m/s^2, 10 rad/s^2. Both go through the same limits of speed, acceleration
-        and room to brake before the edge of the workspace.
+        and room to brake before the edge of the workspace. Both are SI units, so that actions mean the same in
+        datasets, in TorchRL and here; ``gymnasium.wrappers.RescaleAction`` makes them -1 to 1, which learners that
+        explore with noise of size 1 need.
 
     Observation:
         ``state``: float32 ``(16,)`` or, in tasks 2 and 3, ``(20,)``, privileged, for experts (see ``state``
@@ -67,8 +69,8 @@ class DynmapEnv(gym.Env):
         obs_type: ``state``, ``pixels`` or ``pixels_agent_pos``.
         control: ``position`` or ``acceleration``.
         ranges: what scenes are drawn from; by default the task's own.
-        render_mode: ``rgb_array`` or None.
-        render_size: side of what ``render()`` returns, in pixels.
+        render_mode: ``rgb_array``, ``human`` (a window that shows every step in real time), or None.
+        render_size: side of what ``render()`` returns or shows, in pixels.
 
     Reset arguments:
         ``reset(options={"cart_x": 0.3, "block_color": (0, 0, 90), ...})`` fixes any factor of the scene.
@@ -77,7 +79,7 @@ class DynmapEnv(gym.Env):
         v0: first release.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": int(1 / CONTROL_DT)}
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": int(1 / CONTROL_DT)}
 
     def __init__(
         self,
@@ -93,7 +95,7 @@ class DynmapEnv(gym.Env):
         if control not in ACTION_LIMITS:
             raise ValueError(f"unknown control {control!r}; choose from {sorted(ACTION_LIMITS)}")
         if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(f"unknown render_mode {render_mode!r}; choose rgb_array or None")
+            raise ValueError(f"unknown render_mode {render_mode!r}; choose human, rgb_array or None")
         self.task = get_task(task)
         self.task_description = self.task.description
         self.obs_type = obs_type
@@ -104,6 +106,7 @@ class DynmapEnv(gym.Env):
         self._max_episode_steps = EPISODE_STEPS
         self._frames = Renderer(64) if obs_type != "state" else None
         self._large: Renderer | None = None
+        self._window: Window | None = None
         limit = ACTION_LIMITS[control].astype(np.float32)
         self.action_space = spaces.Box(-limit, limit, dtype=np.float32)
         self.observation_space = self._observation_space()
@@ -119,6 +122,7 @@ class DynmapEnv(gym.Env):
         super().reset(seed=seed)
         scene = self.task.sample_scene(self.np_random, self.ranges)
         self.world = self.task.make_world(scene.replace(**(options or {})))
+        self._show()
         return self._observe(), self._info()
 
     def step(self, action: np.ndarray):
@@ -126,16 +130,29 @@ class DynmapEnv(gym.Env):
             self.world.step(action)
         else:
             self.world.accelerate(action)
+        self._show()
         world = self.world
         truncated = world.steps >= EPISODE_STEPS
         return self._observe(), self.task.reward(world), self.task.is_over(world), truncated, self._info()
 
     def render(self) -> np.ndarray | None:
-        """uint8 ``[render_size, render_size, 3]``."""
-        if self.render_mode is None:
-            return None
+        """uint8 ``[render_size, render_size, 3]``; None for ``human``, which is shown without being asked."""
+        return self._draw() if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Close the window."""
+        if self._window is not None:
+            self._window.close()
+            self._window = None
+
+    def _draw(self) -> np.ndarray:
         self._large = self._large or Renderer(self._render_size)
         return self._large.draw(self.world, self.task)
+
+    def _show(self) -> None:
+        if self.render_mode == "human":
+            self._window = self._window or Window(self._render_size, self.metadata["render_fps"])
+            self._window.show(self._draw())
 
     def _observe(self):
         if self.obs_type == "state":

@@ -60,6 +60,31 @@ class Renderer:
         pygame.draw.polygon(self.canvas, color, [(x * scale, (1.0 - y) * scale) for x, y in polygon])
 
 
+class Window:
+    """A window on the screen that shows frames, in real time.
+
+    Args:
+        size: side in pixels.
+        fps: the most frames a second; ``show`` waits for it.
+    """
+
+    def __init__(self, size: int, fps: float):
+        pygame.display.init()
+        pygame.display.set_caption("dynmap_rl")
+        self.screen = pygame.display.set_mode((size, size))
+        self.clock, self.fps = pygame.time.Clock(), fps
+
+    def show(self, frame: np.ndarray) -> None:
+        """uint8 ``[size, size, 3]``."""
+        self.screen.blit(pygame.image.frombuffer(frame, frame.shape[1::-1], "RGB"), (0, 0))
+        pygame.event.pump()  # or the system takes the window for one that hangs
+        pygame.display.flip()
+        self.clock.tick(self.fps)
+
+    def close(self) -> None:
+        pygame.display.quit()
+
+
 def box(x: float, y: float, angle: float, width: float, height: float) -> Polygon:
     """The corners of a rotated rectangle about its centre (m)."""
     c, s = math.cos(angle) / 2, math.sin(angle) / 2

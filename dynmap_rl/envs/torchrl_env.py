@@ -30,6 +30,7 @@ class DynmapBatchedEnv(EnvBase):
 
     A reset draws each world's scene from the environment's seed, or, where the reset TensorDict has an entry
     ``scene_seed`` ``[N]`` (int64), from that: ``env.reset(TensorDict(scene_seed=torch.arange(n), batch_size=[n]))``.
+    A ``TransformedEnv`` hands on no such entry, but arguments: ``env.reset(scene_seed=torch.arange(n))``.
 
     Args:
         task: name of the task, or ``"module:Class"`` of your own.
@@ -100,14 +101,19 @@ class DynmapBatchedEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         self.rng = np.random.default_rng(seed)
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
+    def _reset(
+        self,
+        tensordict: TensorDictBase | None = None,
+        scene_seed: torch.Tensor | None = None,
+        **kwargs,
+    ) -> TensorDictBase:
         n = self.batch_size[0]
         mask = torch.ones(n, dtype=torch.bool)
-        seeds = None
+        seeds = scene_seed
         if tensordict is not None:
             if (flags := tensordict.get("_reset", None)) is not None:
                 mask = flags.reshape(n).cpu()
-            seeds = tensordict.get("scene_seed", None)
+            seeds = tensordict.get("scene_seed", scene_seed)
         for i in mask.nonzero().flatten().tolist():
             seed = int(seeds[i]) if seeds is not None else int(self.rng.integers(2**63))
             scene = self.task.sample_scene(np.random.default_rng(seed), self.ranges)

@@ -1,5 +1,6 @@
 """Closed-loop rollouts, DR / PE / SR, statistics and figures."""
 
+from .held_out import policy_errors, write_held_out
 from .imagination import open_loop_errors
 from .paper import TABLES, paper_numbers, parse_supervision, row_name
 from .report import SHARED_STARTS, evaluate, print_row, write_report
@@ -14,6 +15,7 @@ __all__ = [
     "open_loop_errors",
     "paper_numbers",
     "parse_supervision",
+    "policy_errors",
     "print_row",
     "roll_out",
     "row_name",
@@ -22,5 +24,6 @@ __all__ = [
     "summarize",
     "summarize_seeds",
     "wilson",
+    "write_held_out",
     "write_report",
 ]

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 from tensordict import TensorDictBase
 
-from dynmap_rl.data import load_meta
+from dynmap_rl.data import NO_TASK, load_meta
 from dynmap_rl.envs import scene_seed
 from dynmap_rl.modules import Actor, WorldModel, load_policy
 from dynmap_rl.runs import command_line, read_json, write_json
 
+from .held_out import print_held_out, write_held_out
 from .paper import METRICS, paper_numbers, row_name
 from .rollout import episode_rows, roll_out, scene_seeds
 from .statistics import summarize, summarize_seeds
@@ -64,13 +65,19 @@ def write_report(
         episodes: held-out demonstrations ``[E, T]``, for the figures.
         seeds: of the policies.
         source: where the world model is from, with its ``task`` and ``training``; by default this very run.
+
+    A dataset of no task has no simulator to act in: see :func:`dynmap_rl.evaluation.write_held_out`.
     """
     from .figures import plot_dynamics, plot_reconstruction, save_gif
 
-    meta = load_meta(dataset)
     results = [read_json(folder / f"seed_{seed}" / "eval.json") for seed in seeds]
     if frozen and any(r["world_model_sha256"] != frozen for r in results):
         raise ValueError(f"seeds in {folder} belong to another world model; delete the folder and run again")
+    if settings.task == NO_TASK:
+        return write_held_out(
+            folder, settings, dataset, world_model, episodes, results, seeds, frozen, source
+        )
+    meta = load_meta(dataset)
     source = source or {"task": settings.task, "training": "decoupled"}
     test = [_rows(r["test"]["rows"]) for r in results]
     result = {
@@ -119,6 +126,8 @@ def result_rows(result: dict) -> list[list[dict]]:
 
 def print_row(result: dict) -> None:
     """The table row, beside the paper's."""
+    if result["task"] == NO_TASK:
+        return print_held_out(result)
     ours, test, paper = result["paper_protocol"], result["test_protocol"], paper_numbers(result)
     low, high = test["SR_interval"]
     print(f"\n{_label(result)}, {result['policy']} policy, {result['task']}")

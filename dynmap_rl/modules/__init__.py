@@ -15,7 +15,7 @@ from .normalization import Normalizer
 from .policy import FeedforwardPolicy, RecurrentPolicy
 from .precision import mixed_precision
 from .recurrent import TwoLSTM, delay
-from .tensordict_modules import Actor, make_policy_module, make_world_model_module
+from .tensordict_modules import MEMORY, Actor, LatentActor, make_policy_module, make_world_model_module
 from .transition import Transition
 from .world_model import WorldModel
 
@@ -26,6 +26,8 @@ __all__ = [
     "Encoder",
     "FeedforwardPolicy",
     "ImageDecoder",
+    "LatentActor",
+    "MEMORY",
     "Normalizer",
     "RecurrentPolicy",
     "SpatialSoftmax",

@@ -38,8 +38,10 @@ class TwoLSTM(nn.Module):
         return hidden1, hidden2, (h1[0], c1[0], h2[0], c2[0])
 
     def step(self, x: torch.Tensor, state: State) -> State:
-        """One step: ``[B, input]`` and the state to the next state."""
-        return self(x[:, None], state)[2]
+        """One step: ``[..., input]`` and the state, ``[..., H]`` each, to the next state."""
+        flat = tuple(s.reshape(-1, self.hidden_size) for s in state)
+        after = self(x.reshape(-1, 1, x.shape[-1]), flat)[2]
+        return tuple(s.reshape(*x.shape[:-1], -1) for s in after)
 
     def initial_state(self, batch: int, device=None) -> State:
         return tuple(torch.zeros(batch, self.hidden_size, device=device) for _ in range(4))

@@ -1,7 +1,7 @@
 """Losses."""
 
-from .imitation import imitation_loss
+from .imitation import ImitationLoss, imitation_loss
 from .joint import JointLoss
 from .world_model import WorldModelLoss
 
-__all__ = ["JointLoss", "WorldModelLoss", "imitation_loss"]
+__all__ = ["ImitationLoss", "JointLoss", "WorldModelLoss", "imitation_loss"]

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
-import torch
-from torch.nn import functional as F
+from dataclasses import dataclass
 
-from dynmap_rl.modules import Normalizer
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import dispatch
+from tensordict.utils import NestedKey, unravel_key
+from torch.nn import functional as F
+from torchrl.objectives.common import LossModule
+
+from dynmap_rl.modules import FeedforwardPolicy, Normalizer, RecurrentPolicy
 
 
 def imitation_loss(
@@ -31,3 +37,59 @@ def imitation_loss(
     if ignore is not None:
         weight = weight * ~ignore
     return (error * weight).sum() / weight.sum()
+
+
+def find_ignored(
+    tensordict: TensorDictBase, disturbed: NestedKey, masks: tuple[NestedKey, ...]
+) -> torch.Tensor | None:
+    """Bool ``[B, T, 1]``: the steps that are disturbed or that a mask marks as invalid; None where there is neither."""
+    ignore = tensordict.get(disturbed, None)
+    for key in masks:
+        if (mask := tensordict.get(key, None)) is not None:
+            invalid = ~mask.reshape(*tensordict.shape, 1)
+            ignore = invalid if ignore is None else ignore | invalid
+    return ignore
+
+
+class ImitationLoss(LossModule):
+    """:func:`imitation_loss` of a policy on latents and hidden states (paper, Sec. III-B).
+
+    Input ``[B, T]``: ``latent``, ``hidden1``, ``hidden2``, ``goal``, the demonstrator's ``action`` (SI units) and,
+    optional, ``disturbed`` bool ``[B, T, 1]``: the steps that do not count. A mask of valid steps is optional too, as in
+    :class:`dynmap_rl.objectives.WorldModelLoss`.
+
+    Output: ``loss_policy``, a scalar.
+
+    Args:
+        policy: what is trained.
+        emphasis: see :func:`imitation_loss`.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        latent: NestedKey = "latent"
+        hidden1: NestedKey = "hidden1"
+        hidden2: NestedKey = "hidden2"
+        goal: NestedKey = "goal"
+        action: NestedKey = "action"
+        disturbed: NestedKey = "disturbed"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    out_keys = ["loss_policy"]
+
+    def __init__(self, policy: FeedforwardPolicy | RecurrentPolicy, emphasis: float = 0.0):
+        super().__init__()
+        self.policy, self.emphasis = policy, emphasis
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        keys = self.tensor_keys
+        return [unravel_key(k) for k in (keys.latent, keys.hidden1, keys.hidden2, keys.goal, keys.action)]
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        *states, action = (tensordict[key] for key in self.in_keys)
+        ignore = find_ignored(tensordict, self.tensor_keys.disturbed, self._loss_mask_keys())
+        loss = imitation_loss(self.policy(*states), action, self.policy.action, ignore, self.emphasis)
+        return TensorDict({"loss_policy": loss}, [])

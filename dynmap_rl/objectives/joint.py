@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from tensordict import TensorDict, TensorDictBase
-from tensordict.utils import NestedKey
+from tensordict.nn import dispatch
+from tensordict.utils import NestedKey, unravel_key
 from torchrl.objectives.common import LossModule
 
 from dynmap_rl.modules import FeedforwardPolicy, RecurrentPolicy
 
-from .imitation import imitation_loss
+from .imitation import find_ignored, imitation_loss
 from .world_model import WorldModelLoss
 
 
@@ -18,7 +19,7 @@ class JointLoss(LossModule):
     """Eq. 4 with the dynamics terms of Eq. 5, or Eq. 3: the policy's loss reaches encoder and transition.
 
     Input: that of :class:`WorldModelLoss`, with ``goal`` ``[B, T, G]`` and, optional, ``disturbed`` bool
-    ``[B, T, 1]``: the steps that imitation leaves out.
+    ``[B, T, 1]``: the steps that imitation leaves out, as it does those that a mask marks as invalid.
 
     Output: ``loss_policy`` (times ``beta_joint``) and, but for end-to-end training, the world model's losses.
 
@@ -32,9 +33,13 @@ class JointLoss(LossModule):
 
     @dataclass
     class _AcceptedKeys:
+        pixels: NestedKey = "pixels"
+        action: NestedKey = "action"
+        dynamics: NestedKey = "dynamics"
         goal: NestedKey = "goal"
         disturbed: NestedKey = "disturbed"
 
+    tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
 
     def __init__(
@@ -48,12 +53,39 @@ class JointLoss(LossModule):
         super().__init__()
         self.world_model_loss, self.policy = world_model_loss, policy
         self.beta_joint, self.emphasis, self.end_to_end = beta_joint, emphasis, end_to_end
+        super().set_keys(**vars(world_model_loss.tensor_keys))
 
+    def set_keys(self, **kwargs) -> None:
+        """Those of the world model's loss are its keys too."""
+        super().set_keys(**kwargs)
+        own = ("goal", "disturbed")
+        self.world_model_loss.set_keys(**{k: v for k, v in kwargs.items() if k not in own})
+
+    @property
+    def loss_mask_key(self) -> NestedKey | None:
+        """That of the world model's loss (see :class:`torchrl.objectives.LossModule`)."""
+        return self.world_model_loss.loss_mask_key
+
+    @loss_mask_key.setter
+    def loss_mask_key(self, key: NestedKey | None) -> None:
+        self.world_model_loss.loss_mask_key = key
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        keys = self.world_model_loss.in_keys
+        return [*(keys[:2] if self.end_to_end else keys), unravel_key(self.tensor_keys.goal)]
+
+    @property
+    def out_keys(self) -> list[str]:
+        return [*([] if self.end_to_end else self.world_model_loss.out_keys), "loss_policy"]
+
+    @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         latent, states = self.world_model_loss.predict(tensordict)
         losses = {} if self.end_to_end else self.world_model_loss.compare(tensordict, latent, states)
-        predicted = self.policy(latent, *states[1:], tensordict.get(self.tensor_keys.goal))
-        action = tensordict.get(self.world_model_loss.tensor_keys.action)
-        ignore = tensordict.get(self.tensor_keys.disturbed, None)
+        predicted = self.policy(latent, *states[1:], tensordict[self.tensor_keys.goal])
+        action = tensordict[self.world_model_loss.tensor_keys.action]
+        masks = self.world_model_loss._loss_mask_keys()
+        ignore = find_ignored(tensordict, self.tensor_keys.disturbed, masks)
         loss = imitation_loss(predicted, action, self.policy.action, ignore, self.emphasis)
         return TensorDict({**losses, "loss_policy": self.beta_joint * loss}, [])

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.utils import NestedKey
+from tensordict.nn import dispatch
+from tensordict.utils import NestedKey, unravel_key
 from torchrl.objectives.common import LossModule
 
 from dynmap_rl.modules import WorldModel
@@ -22,6 +23,9 @@ class WorldModelLoss(LossModule):
 
     Input: ``pixels`` uint8 ``[B, T, 3, 64, 64]``, ``action`` ``[B, T, A]`` and, for the model's supervision,
     ``("dynamics", quantity)`` ``[B, T, D]``, in SI units.
+
+    Steps that a mask marks as invalid (bool ``[B, T]`` or ``[B, T, 1]``, false where padded) do not count; which
+    entry that is says ``loss_mask_key`` of :class:`torchrl.objectives.LossModule`, by default ``("collector", "mask")``.
 
     Output: ``loss_rgb``, ``loss_latent`` (times ``beta_z``), ``loss_position``, ``loss_velocity``,
     ``loss_acceleration`` (those supervised, times ``beta_dynamics``): scalars whose sum is to be minimised.
@@ -41,6 +45,7 @@ class WorldModelLoss(LossModule):
         action: NestedKey = "action"
         dynamics: NestedKey = "dynamics"
 
+    tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
 
     def __init__(
@@ -56,46 +61,62 @@ class WorldModelLoss(LossModule):
         self.beta_z, self.beta_dynamics = beta_z, beta_dynamics
         self.stop_gradient, self.rgb_steps = stop_gradient, rgb_steps
 
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        keys = self.tensor_keys
+        dynamics = [(keys.dynamics, quantity) for quantity in self.world_model.supervision]
+        return [unravel_key(key) for key in (keys.pixels, keys.action, *dynamics)]
+
+    @property
+    def out_keys(self) -> list[str]:
+        return [f"loss_{name}" for name in ("rgb", "latent", *self.world_model.supervision)]
+
+    @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         return TensorDict(self.compare(tensordict, *self.predict(tensordict)), [])
 
     def predict(self, tensordict: TensorDictBase) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
         """The latents ``[B, T, Z]``, and ``predicted_latent``, ``hidden1``, ``hidden2`` at every t."""
-        latent = self.world_model.encode(tensordict.get(self.tensor_keys.pixels)).float()
+        latent = self.world_model.encode(tensordict[self.tensor_keys.pixels]).float()
         with torch.autocast(latent.device.type, enabled=False):
-            return latent, self.world_model.predict(latent, tensordict.get(self.tensor_keys.action))
+            return latent, self.world_model.predict(latent, tensordict[self.tensor_keys.action])
 
     def compare(self, tensordict: TensorDictBase, latent: torch.Tensor, states) -> dict[str, torch.Tensor]:
         """The losses by name, for what :meth:`predict` gave."""
         model, keys = self.world_model, self.tensor_keys
         predicted, hidden1, hidden2 = (x[:, 1:] for x in states)  # (B, T-1, .)
-        pixels = tensordict.get(keys.pixels)[:, 1:]
+        pixels = tensordict[keys.pixels][:, 1:]
+        masks = tensordict.select(*self._loss_mask_keys(), strict=False)[:, 1:]
         losses = {
-            "loss_rgb": self._rgb_loss(pixels, predicted, hidden1, hidden2),
-            "loss_latent": self.beta_z * self._latent_loss(latent, predicted),
+            "loss_rgb": self._rgb_loss(masks, pixels, predicted, hidden1, hidden2),
+            "loss_latent": self.beta_z * self._mean(self._latent_error(latent, predicted), masks),
         }
         for name, value in model.decode_dynamics(predicted, hidden1, hidden2).items():
             scale = model.dynamics_decoder.normalizers[name].scale
-            truth = tensordict.get((keys.dynamics, name))[:, 1:]
-            losses[f"loss_{name}"] = self.beta_dynamics * rms((value - truth) / scale).mean()
+            truth = tensordict[unravel_key((keys.dynamics, name))][:, 1:]
+            losses[f"loss_{name}"] = self.beta_dynamics * self._mean(rms((value - truth) / scale), masks)
         return losses
 
-    def _latent_loss(self, latent, predicted) -> torch.Tensor:
+    def _mean(self, error: torch.Tensor, masks: TensorDictBase) -> torch.Tensor:
+        """Over the steps ``[B, T]`` that count."""
+        return self._reduce_loss(error, masks, reduction="mean")
+
+    def _latent_error(self, latent, predicted) -> torch.Tensor:
         before, target = latent[:, :-1], latent[:, 1:]
         if self.stop_gradient:
             predicted = predicted - before + before.detach()  # only the predicted change is moved
             target = target.detach()
-        return rms(predicted - target).mean()
+        return rms(predicted - target)
 
-    def _rgb_loss(self, pixels, *states) -> torch.Tensor:
+    def _rgb_loss(self, masks, pixels, *states) -> torch.Tensor:
         steps = pixels.shape[1]
         if self.rgb_steps is not None and self.rgb_steps < steps:
             index = torch.randperm(steps, device=pixels.device)[: self.rgb_steps]
-            pixels, states = pixels[:, index], [s[:, index] for s in states]
+            masks, pixels, states = masks[:, index], pixels[:, index], [s[:, index] for s in states]
         blocks = self.world_model.image_decoder.decode_blocks(*states).flatten(0, 1)
         target = to_blocks(pixels.flatten(0, 1)).to(blocks.dtype) * (1 / 255) - 0.5
         norm = torch.linalg.vector_norm(blocks - target, dim=(1, 2, 3)).float()
-        return norm.mean() / blocks[0].numel() ** 0.5
+        return self._mean(norm.view(masks.shape), masks) / blocks[0].numel() ** 0.5
 
 
 def rms(x: torch.Tensor) -> torch.Tensor:

@@ -1,7 +1,7 @@
 """The speed table of the README: every row times two things in one run and gives their ratio.
 
-    uv run --group benchmarks python tests/benchmarks/run.py            # all rows
-    uv run --group benchmarks python tests/benchmarks/run.py batch ppo  # some of them
+    uv run --extra benchmarks python tests/benchmarks/run.py            # all rows
+    uv run --extra benchmarks python tests/benchmarks/run.py batch ppo  # some of them
 
 Needs ``datasets/balance_reaching`` (``python recipes/collect.py``). Writes ``recipes/results/benchmarks.json``, where
 rows that were not asked for stay as they are.

@@ -1,6 +1,7 @@
 """The batched TorchRL environment: its specs, its resets, and its agreement with the Gymnasium ids."""
 
 from dataclasses import replace
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
+from torchrl.envs import InitTracker, ParallelEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from dynmap_rl import GYMNASIUM_IDS
@@ -165,6 +167,27 @@ def test_works_in_a_collector():
     following = torch.cat([batch["next", "dynamics", "position"] for batch in batches], 1)
     going_on = ~torch.cat([batch["next", "done"] for batch in batches], 1)[:, :-1].squeeze(-1)
     assert torch.equal(position[:, 1:][going_on], following[:, :-1][going_on])
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*use of fork")
+def test_worlds_in_processes_of_their_own_are_the_same_worlds():
+    make = partial(DynmapBatchedEnv, num_envs=2, from_pixels=True)
+    env = ParallelEnv(2, make, mp_start_method="fork")
+    try:
+        check_env_specs(env)
+        check_env_specs(TransformedEnv(env, InitTracker()))
+        env.set_seed(3)
+        out = env.rollout(5)
+    finally:
+        env.close()
+    first = make()
+    first.set_seed(3)
+    alone = first.reset()
+    assert torch.equal(out["goal"][0, :, 0], alone["goal"])
+    for t in range(5):
+        assert torch.equal(out["pixels"][0, :, t], alone["pixels"])
+        alone = first.step(alone.set("action", out["action"][0, :, t]))["next"]
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,154 @@
+"""PPO, from states for the experts (paper, Sec. IV-C) and from whatever else an environment's ``state`` holds."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase
+from torchrl.modules import MLP, ValueOperator
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+from tqdm import tqdm
+
+from dynmap_rl import runs
+from dynmap_rl.envs import scene_seed
+from dynmap_rl.envs.tasks import BalanceReaching
+from dynmap_rl.envs.world import EPISODE_STEPS, World
+
+from .policy import ExpertNetwork, make_actor
+
+
+def train_ppo(
+    env: EnvBase,
+    network: ExpertNetwork,
+    folder: Path,
+    settings,
+    judge: Callable[[int], dict[str, float]],
+    facts: dict,
+) -> None:
+    """Train a network on ``state``; a stopped run goes on from its last iteration, to the same weights.
+
+    Args:
+        env: ``[N]`` worlds with ``state``, ``is_success`` and ``dropped``, controlled by accelerations.
+        network: changed in place.
+        folder: run folder; gets ``metrics.jsonl`` and, in ``checkpoint``, ``iteration_NNN`` as safetensors and JSON
+            every ``checkpoint_every`` iterations, and the training state.
+        settings: with ``seed``, ``iterations``, ``epochs``, ``minibatch``, ``learning_rate``, ``gamma``,
+            ``gae_lambda``, ``clip``, ``entropy``, ``checkpoint_every``, ``eval_episodes`` and ``final_episodes``.
+        judge: rates of the network's mean action on so many fresh scenes, at least ``success`` and ``drop``.
+        facts: about the run, written to the JSON of each checkpoint with what ``judge`` says.
+    """
+    inputs, width = network.mlp[0].in_features, network.mlp[0].out_features
+    actor = make_actor(network)
+    critic = ValueOperator(
+        MLP(inputs, 1, num_cells=[width, width], activation_class=torch.nn.Tanh), in_keys=["state"]
+    )
+    advantage = GAE(
+        gamma=settings.gamma, lmbda=settings.gae_lambda, value_network=critic, average_gae=True, shifted=True
+    )
+    loss_module = ClipPPOLoss(
+        actor, critic, clip_epsilon=settings.clip, entropy_coeff=settings.entropy, critic_coeff=1.0
+    )
+    optimizer = torch.optim.Adam(loss_module.parameters(), lr=settings.learning_rate, eps=1e-5)
+
+    start, seconds = 0, 0.0
+    state_path = folder / "checkpoint" / "training_state.pt"
+    if state := runs.load_training_state(state_path):
+        loss_module.load_state_dict(state["loss_module"])
+        optimizer.load_state_dict(state["optimizer"])
+        start, seconds = state["iteration"], state["seconds"]
+    runs.truncate_metrics(folder, start)
+
+    # Every iteration starts from fresh, seeded scenes, so that a resumed run equals an uninterrupted one.
+    frames = env.batch_size.numel() * EPISODE_STEPS
+    collector = Collector(
+        env,
+        actor,
+        frames_per_batch=frames,
+        total_frames=-1,
+        reset_at_each_iter=True,
+        auto_register_policy_transforms=False,
+    )
+    batches = iter(collector)
+    progress = tqdm(
+        range(start, settings.iterations), initial=start, total=settings.iterations, unit="iteration"
+    )
+    for iteration in progress:
+        began = time.perf_counter()
+        runs.seed_everything(settings.seed + 1000 * (iteration + 1))
+        env.set_seed(settings.seed + 1000 * (iteration + 1))
+        for group in optimizer.param_groups:
+            group["lr"] = settings.learning_rate * (1 - 0.9 * iteration / settings.iterations)
+        batch = next(batches)
+        losses = update(batch, loss_module, advantage, optimizer, settings.epochs, settings.minibatch)
+        done = batch["next", "done"].squeeze(-1)
+        seconds += time.perf_counter() - began
+        metrics = {
+            "frames": (iteration + 1) * frames,
+            "seconds": seconds,
+            "reward": batch["next", "reward"].mean(),
+            "success": batch["next", "is_success"].squeeze(-1)[done].float().mean(),
+            "drop": batch["next", "dropped"].squeeze(-1)[done].float().mean(),
+            **losses,
+        }
+        runs.append_metrics(folder, iteration + 1, **metrics)
+        progress.set_postfix(success=f"{metrics['success']:.2f}", drop=f"{metrics['drop']:.2f}")
+        last = iteration + 1 == settings.iterations
+        if last or (iteration + 1) % settings.checkpoint_every == 0:
+            judged = judge(settings.final_episodes if last else settings.eval_episodes)
+            path = folder / "checkpoint" / f"iteration_{iteration + 1:03d}"
+            runs.save_weights(path.with_suffix(".safetensors"), network)
+            at = {"iteration": iteration + 1, "frames": metrics["frames"], "seconds": round(seconds, 1)}
+            runs.write_json(path.with_suffix(".json"), judged | facts | at)
+            progress.write(
+                f"iteration {iteration + 1}: success {judged['success']:.1%}, drop {judged['drop']:.1%}"
+            )
+        runs.save_training_state(
+            state_path,
+            loss_module=loss_module.state_dict(),
+            optimizer=optimizer.state_dict(),
+            iteration=iteration + 1,
+            seconds=seconds,
+        )
+    collector.shutdown()
+
+
+def update(
+    batch: TensorDictBase, loss_module: ClipPPOLoss, advantage: GAE, optimizer, epochs: int, minibatch: int
+) -> dict[str, float]:
+    """PPO's epochs of minibatches over one batch ``[N, T]``."""
+    with torch.no_grad():
+        batch = advantage(batch)
+    batch = batch.select(
+        "state", "action", "action_log_prob", "loc", "scale", "advantage", "value_target", "state_value"
+    ).reshape(-1)
+    for _ in range(epochs):
+        for index in torch.randperm(len(batch)).split(minibatch):
+            losses = loss_module(batch[index])
+            loss = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
+            optimizer.zero_grad()
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(loss_module.parameters(), 0.5)
+            optimizer.step()
+    return {k: losses[k].item() for k in ("loss_objective", "loss_critic", "entropy")}
+
+
+def rates(task: BalanceReaching, worlds: Iterable[World]) -> dict[str, float]:
+    """``success``, ``drop``, ``position_error`` (m) and number of ``episodes`` of worlds at their ends."""
+    worlds = list(worlds)
+    return {
+        "success": sum(task.is_success(world) for world in worlds) / len(worlds),
+        "drop": sum(world.dropped for world in worlds) / len(worlds),
+        "position_error": sum(world.position_error for world in worlds) / len(worlds),
+        "episodes": len(worlds),
+    }
+
+
+def fresh_scenes(count: int) -> list[int]:
+    """Seeds of scenes for choosing a checkpoint: of the exploration split, never evaluated or trained on."""
+    return [scene_seed("exploration", 10_000_000 + i) for i in range(count)]

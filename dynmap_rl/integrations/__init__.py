@@ -1,0 +1,1 @@
+"""Our environments, data and models in the tools of others."""

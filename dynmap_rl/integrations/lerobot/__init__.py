@@ -1,0 +1,12 @@
+"""LeRobot's own commands on our environments, data and models.
+
+Importing it registers the environment ``dynmap`` and the policy ``dynmap``. LeRobot does so by
+``--policy.discover_packages_path=dynmap_rl.integrations.lerobot``, or without an option where the distribution in
+``dynmap_rl/integrations/lerobot_policy_dynmap`` is installed.
+"""
+
+from .configuration_dynmap import DynmapConfig
+from .environment import DynmapEnvConfig
+from .export import export_to_lerobot, import_from_lerobot
+
+__all__ = ["DynmapConfig", "DynmapEnvConfig", "export_to_lerobot", "import_from_lerobot"]

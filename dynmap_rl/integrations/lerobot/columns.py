@@ -1,0 +1,66 @@
+"""The columns that LeRobot's preprocessors drop on the way to a policy, read from the dataset's files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import torch
+from tensordict import TensorDict
+
+from dynmap_rl.data import load_meta, normalization_constants
+from dynmap_rl.data.loading import META, NEEDED
+from dynmap_rl.envs.tasks import get_task
+
+
+def read_columns(root: str | Path) -> TensorDict:
+    """All numbers of a dataset but the frames, in memory.
+
+    Args:
+        root: its folder.
+
+    Returns:
+        ``[N]``, the frame of LeRobot's ``index`` i in row i: ``action`` ``[N, 3]``, ``goal`` ``[N, 2]``,
+        ``("dynamics", "position" | "velocity" | "acceleration")`` ``[N, 6]`` in SI units, and ``disturbed``
+        ``[N, 1]``: the steps in which a push acted, so far as the recording tells.
+
+    Raises:
+        ValueError: columns are missing, or the files are not on this machine.
+    """
+    files = sorted((Path(root) / "data").glob("*/*.parquet"))
+    if not files:
+        raise ValueError(f"{root} has no data files; the policy dynmap cannot train on a streamed dataset")
+    if missing := set(NEEDED.values()) - set(pq.read_schema(files[0]).names):
+        raise ValueError(f"{root} lacks the columns {', '.join(sorted(missing))}, which dynmap learns from")
+    names = ["index", "episode_index", "frame_index", *NEEDED.values()]
+    table = pa.concat_tables([pq.ParquetFile(file).read(names) for file in files]).sort_by("index")
+    if not (table["index"].to_numpy() == np.arange(len(table))).all():
+        raise ValueError(f"{root}: the column index does not count the frames; repair or record the dataset")
+    data = {key: torch.from_numpy(np.stack(table[name].to_numpy())).float() for key, name in NEEDED.items()}
+    data["goal"] = data.pop("agent_pos")[:, -2:]
+    data["disturbed"] = _mark_pushes(Path(root), table)
+    return TensorDict(data, [len(table)])
+
+
+def _mark_pushes(root: Path, table: pa.Table) -> torch.Tensor:
+    episode, frame = table["episode_index"].to_numpy(), table["frame_index"].to_numpy()
+    pushed = np.zeros((len(table), 1), bool)
+    for row in load_meta(root)["episodes"] if (root / META).exists() else ():
+        for start, end in row.get("pushes", ()):
+            pushed[(episode == row["episode_index"]) & (frame >= start) & (frame < end)] = True
+    return torch.from_numpy(pushed)
+
+
+def find_constants(root: str | Path, columns: TensorDict) -> dict[str, dict[str, list[float]]]:
+    """The constants of normalisation (see :func:`dynmap_rl.data.normalization_constants`): those of the recording, or,
+    of a dataset that has been edited since, of all its frames."""
+    if (Path(root) / META).exists():
+        return load_meta(root)["normalization"]
+    return normalization_constants(columns[None])
+
+
+def is_symmetric(root: str | Path) -> bool:
+    """Whether mirrored and shifted demonstrations of the dataset's task are demonstrations, so far as it tells."""
+    return (Path(root) / META).exists() and get_task(load_meta(root)["task"]).symmetric

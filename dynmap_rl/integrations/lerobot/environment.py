@@ -1,0 +1,113 @@
+"""Our Gymnasium environments as LeRobot's environment ``dynmap``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import partial
+
+import gymnasium as gym
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs import EnvConfig
+from lerobot.envs.utils import NEW_ROLLOUT_OPTION
+from lerobot.processor import PolicyProcessorPipeline, RenameObservationsProcessorStep
+from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
+
+from dynmap_rl import GYMNASIUM_IDS
+from dynmap_rl.data.loading import CAMERA, FRAME_SHAPE
+from dynmap_rl.data.writing import FPS
+from dynmap_rl.envs import scene_seed
+from dynmap_rl.envs.world import EPISODE_STEPS
+
+IDS = {task: name for name, task in GYMNASIUM_IDS.items()}
+
+
+@EnvConfig.register_subclass("dynmap")
+@dataclass
+class DynmapEnvConfig(EnvConfig):
+    """``--env.type=dynmap``: observations are named as in our datasets.
+
+    Args:
+        task: ``balance_reaching``, ``balance_reaching_obstacle`` or ``bin_dropping``.
+        fps, episode_length: 20 Hz and 120 steps, which the tasks are defined by.
+        split: of the scenes. ``--seed`` counts within it, so that no evaluation is on scenes of the demonstrations:
+            ``test`` with 0 to 999 are the start states of our tables, ``validation`` is for choosing settings.
+        render_size: side of the frames of a video, in pixels; an even number.
+
+    Raises:
+        ValueError: an unknown task or split, or another length or rate.
+    """
+
+    task: str | None = "balance_reaching"
+    fps: int = FPS
+    episode_length: int = EPISODE_STEPS
+    split: str = "test"
+    render_size: int = 256
+    features: dict[str, PolicyFeature] = field(
+        default_factory=lambda: {
+            ACTION: PolicyFeature(FeatureType.ACTION, (3,)),
+            "agent_pos": PolicyFeature(FeatureType.STATE, (5,)),
+            "pixels": PolicyFeature(FeatureType.VISUAL, FRAME_SHAPE),
+        }
+    )
+    features_map: dict[str, str] = field(
+        default_factory=lambda: {ACTION: ACTION, "agent_pos": OBS_STATE, "pixels": CAMERA}
+    )
+
+    def __post_init__(self):
+        if self.task not in IDS:
+            raise ValueError(f"--env.task is one of {', '.join(IDS)}, not {self.task!r}")
+        scene_seed(self.split, 0)
+        if (self.fps, self.episode_length) != (FPS, EPISODE_STEPS):
+            raise ValueError(f"episodes of {self.task} have {EPISODE_STEPS} steps at {FPS} Hz")
+
+    @property
+    def package_name(self) -> str:
+        return "dynmap_rl"
+
+    @property
+    def gym_id(self) -> str:
+        return IDS[self.task]
+
+    @property
+    def gym_kwargs(self) -> dict:
+        return {"obs_type": "pixels_agent_pos", "render_mode": "rgb_array", "render_size": self.render_size}
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, VectorEnv]]:
+        """One vector environment of ``n_envs`` scenes, as ``{suite: {number: environments}}``."""
+        makers = [partial(_make, self.gym_id, self.gym_kwargs, self.split)] * n_envs
+        if use_async_envs and n_envs > 1:
+            envs = AsyncVectorEnv(makers, context="forkserver", autoreset_mode=AutoresetMode.SAME_STEP)
+        else:
+            envs = SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP)
+        return {self.type: {0: envs}}
+
+    def get_env_processors(self):
+        # LeRobot calls the frames of an environment with one camera observation.image.
+        rename = RenameObservationsProcessorStep({OBS_IMAGE: CAMERA})
+        return PolicyProcessorPipeline(steps=[rename]), PolicyProcessorPipeline(steps=[])
+
+
+class _ForLeRobot(gym.Wrapper):
+    """Seeds count within a split. LeRobot's mark of a new rollout is taken from the options of a reset, which are factors
+    of the scene here, and ``info`` has plain values: a vector environment stores NumPy's booleans as objects, None
+    where an episode goes on.
+    """
+
+    def __init__(self, env: gym.Env, split: str):
+        super().__init__(env)
+        self.split = split
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None):
+        seed = None if seed is None else scene_seed(self.split, seed)
+        options = {name: value for name, value in (options or {}).items() if name != NEW_ROLLOUT_OPTION}
+        observation, info = self.env.reset(seed=seed, options=options)
+        return observation, {name: value.item() for name, value in info.items()}
+
+    def step(self, action):
+        *result, info = self.env.step(action)
+        return *result, {name: value.item() for name, value in info.items()}
+
+
+def _make(gym_id: str, arguments: dict, split: str) -> gym.Env:
+    return _ForLeRobot(gym.make(gym_id, disable_env_checker=True, **arguments), split)

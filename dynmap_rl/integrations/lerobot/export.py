@@ -1,0 +1,76 @@
+"""Run folders of ours as LeRobot's ``pretrained_model`` folders, and back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.utils.constants import ACTION, OBS_STATE
+
+from dynmap_rl import modules
+from dynmap_rl.data.loading import CAMERA, FRAME_SHAPE
+
+from .configuration_dynmap import DynmapConfig
+from .modeling_dynmap import SIZES, DynmapPolicy
+from .processor_dynmap import make_dynmap_pre_post_processors
+
+
+def export_to_lerobot(run: str | Path, folder: str | Path, seed: int = 0) -> Path:
+    """Write world model and policy of a run as ``lerobot-eval --policy.path`` and ``lerobot-train --policy.path`` take
+    them.
+
+    Args:
+        run: a run folder of ``recipes/decoupled.py``, ``joint.py``, ``end_to_end.py`` or ``generalize.py``.
+        folder: gets ``config.json``, ``model.safetensors`` and the processors.
+        seed: of the policy.
+
+    Raises:
+        ValueError: the run holds no such policy, or one of another scene than ours.
+    """
+    run, folder = Path(run), Path(folder)
+    own = run / f"seed_{seed}" / "world_model"  # joint training has one for each seed
+    world_model = modules.load_world_model(own if own.exists() else run / "world_model")
+    policy = modules.load_policy(run / f"seed_{seed}" / "policy")
+    sizes = {"action": policy.action.size, "goal": policy.goal.size}
+    sizes |= {name: n.size for name, n in world_model.dynamics_decoder.normalizers.items()}
+    if other := {name: size for name, size in sizes.items() if size != SIZES[name]}:
+        raise ValueError(f"{run} is of another scene than ours, by the sizes of {other}")
+    config = DynmapConfig(
+        supervision=",".join(world_model.supervision) or "none",
+        kind="recurrent" if isinstance(policy, modules.RecurrentPolicy) else "feedforward",
+        latent_size=world_model.latent_size,
+        hidden_size=world_model.hidden_size,
+        keypoints=world_model.keypoints,
+        width=policy.width,
+        input_features={
+            CAMERA: PolicyFeature(FeatureType.VISUAL, (FRAME_SHAPE[2], *FRAME_SHAPE[:2])),
+            OBS_STATE: PolicyFeature(FeatureType.STATE, (5,)),
+        },
+        output_features={ACTION: PolicyFeature(FeatureType.ACTION, (3,))},
+    )
+    exported = DynmapPolicy(config)
+    exported.world_model.load_state_dict(world_model.state_dict())
+    exported.policy.load_state_dict(policy.state_dict())
+    exported.save_pretrained(folder)
+    for processor in make_dynmap_pre_post_processors(config):
+        processor.save_pretrained(folder)
+    return folder
+
+
+def import_from_lerobot(folder: str | Path, run: str | Path, seed: int = 0) -> Path:
+    """Write world model and policy of a ``pretrained_model`` folder as a run folder of ours: ``world_model`` and
+    ``seed_N/policy``, for :func:`dynmap_rl.modules.load_world_model` and :func:`~dynmap_rl.modules.load_policy`.
+
+    Raises:
+        ValueError: the folder holds no policy ``dynmap``.
+    """
+    folder, run = Path(folder), Path(run)
+    if not (folder / "config.json").exists():
+        raise ValueError(f"{folder} holds no LeRobot policy (no config.json)")
+    config = DynmapConfig.from_pretrained(folder)
+    if not isinstance(config, DynmapConfig):
+        raise ValueError(f"{folder} holds a policy of the type {config.type}, not dynmap")
+    policy = DynmapPolicy.from_pretrained(folder, config=config, strict=True)
+    modules.save_world_model(run / "world_model", policy.world_model)
+    modules.save_policy(run / f"seed_{seed}" / "policy", policy.policy, policy.world_model)
+    return run

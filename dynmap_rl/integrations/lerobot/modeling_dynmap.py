@@ -1,0 +1,136 @@
+"""World model and policy as LeRobot's policy ``dynmap``: joint training on windows, recurrent control."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+
+import torch
+from lerobot.policies import PreTrainedPolicy
+from lerobot.utils.constants import ACTION, OBS_STATE
+from tensordict import TensorDict
+
+from dynmap_rl.data import add_distractors, augment
+from dynmap_rl.evaluation.paper import parse_supervision
+from dynmap_rl.modules import DYNAMICS, make_policy, make_world_model, mixed_precision
+from dynmap_rl.objectives import JointLoss, WorldModelLoss
+
+from .columns import find_constants, is_symmetric, read_columns
+from .configuration_dynmap import DynmapConfig
+
+SIZES = {"action": 3, "goal": 2, **dict.fromkeys(DYNAMICS, 6)}
+
+
+class DynmapPolicy(PreTrainedPolicy):
+    """A :class:`dynmap_rl.modules.WorldModel` and the policy that acts on its states.
+
+    Args:
+        config: settings.
+        dataset_stats: LeRobot's statistics; not used.
+        dataset_meta: of the dataset to train on. It gives a new policy the constants of normalisation, which are then
+            saved with the weights, and the targets ``dynamics.*``, which LeRobot does not put into a batch.
+
+    Raises:
+        ValueError: features or columns do not fit.
+    """
+
+    config_class = DynmapConfig
+    name = "dynmap"
+
+    def __init__(self, config: DynmapConfig, dataset_stats=None, dataset_meta=None):
+        super().__init__(config)
+        config.validate_features()
+        self.config = config
+        # Where there is no dataset, weights from a checkpoint overwrite these.
+        constants = {name: {"low": [-1.0] * size, "high": [1.0] * size} for name, size in SIZES.items()}
+        self.trainable, self.symmetric = dataset_meta is not None, bool(config.symmetric)
+        if dataset_meta is not None:
+            columns = read_columns(dataset_meta.root)
+            constants = find_constants(dataset_meta.root, columns)
+            if config.symmetric is None:
+                self.symmetric = is_symmetric(dataset_meta.root)
+            # Buffers, to be on the model's device, but no part of a checkpoint.
+            self.register_buffer("disturbed", columns["disturbed"], persistent=False)
+            for name in DYNAMICS:
+                self.register_buffer(name, columns["dynamics", name], persistent=False)
+        sizes = config.latent_size, config.hidden_size, config.keypoints
+        self.world_model = make_world_model(constants, parse_supervision(config.supervision), *sizes)
+        width = {"width": config.width} if config.width else {}
+        self.policy = make_policy(constants, config.kind, self.world_model, **width)
+        self.reset()
+
+    def get_optim_params(self):
+        return self.parameters()
+
+    def reset(self) -> None:
+        """Clear the memory: an episode begins in every environment of the batch."""
+        self._memory = None
+
+    def forward(self, batch: dict[str, torch.Tensor]) -> tuple[torch.Tensor, dict[str, float]]:
+        """The joint loss on windows ``[B, T]`` from LeRobot's loader, and its terms by name."""
+        windows = self.make_windows(batch)
+        if self.training:
+            windows = self._augment(windows)
+        config = self.config
+        world_model_loss = WorldModelLoss(
+            self.world_model, config.beta_z, config.beta_dynamics, rgb_steps=config.rgb_steps
+        )
+        # Made anew, for as an attribute it would save all weights a second time.
+        loss_module = JointLoss(world_model_loss, self.policy, config.beta_joint, config.emphasis)
+        with mixed_precision(windows.device) if config.mixed else nullcontext():
+            losses = loss_module(windows)
+        return sum(losses.values()), {name: value.item() for name, value in losses.items()}
+
+    def make_windows(self, batch: dict[str, torch.Tensor]) -> TensorDict:
+        """A batch of LeRobot's as our losses want it: ``[B, T]`` with ``pixels``, ``action``, ``goal``, ``dynamics``
+        and ``disturbed``, which is also true beyond the end of an episode.
+
+        Raises:
+            ValueError: the policy was made without a dataset.
+        """
+        if not self.trainable:
+            raise ValueError(
+                "this policy was made without dataset_meta, and so has no dynamics to learn from"
+            )
+        action, beyond = batch[ACTION], batch["action_is_pad"]
+        steps = torch.arange(action.shape[1], device=action.device)
+        last = (~beyond).sum(1, keepdim=True) - 1
+        rows = batch["index"].view(-1, 1) + torch.minimum(steps, last)  # (B, T), within the episode
+        data = {
+            "pixels": to_bytes(batch[self.config.camera]),
+            "action": action,
+            "goal": batch[OBS_STATE][..., -2:],
+            "dynamics": {name: getattr(self, name)[rows] for name in DYNAMICS},
+            "disturbed": self.disturbed[rows] | beyond.unsqueeze(-1),
+        }
+        return TensorDict(data, action.shape[:2], device=action.device)
+
+    def _augment(self, windows: TensorDict) -> TensorDict:
+        if not self.config.recolor:
+            return windows
+        # Seeded by torch's own generator, which LeRobot saves and restores.
+        generator = torch.Generator(windows.device).manual_seed(torch.randint(2**62, ()).item())
+        limits = {} if self.symmetric else {"max_shift": 0, "mirror": False}
+        return add_distractors(augment(windows, generator, **limits), generator, self.config.distractors)
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, torch.Tensor], **kwargs) -> torch.Tensor:
+        """The action ``[B, 3]`` (m, m, rad) for the frames ``[B, 3, 64, 64]`` and states ``[B, 5]`` of this step."""
+        self.eval()
+        pixels, goal = to_bytes(batch[self.config.camera]), batch[OBS_STATE][:, -2:]
+        if self._memory is None:
+            start = len(pixels), pixels.device
+            self._memory = self.world_model.initial_state(*start), self.policy.initial_state(*start)
+        state, policy_state = self._memory
+        latent = self.world_model.encode(pixels, self.config.mixed)
+        action, policy_state = self.policy.step(latent, state[0], state[2], goal, policy_state)
+        self._memory = self.world_model.step(latent, action, state)[1], policy_state
+        return action
+
+    def predict_action_chunk(self, batch: dict[str, torch.Tensor], **kwargs) -> torch.Tensor:
+        """A chunk of one action, ``[B, 1, 3]``: each needs the frame before it."""
+        return self.select_action(batch)[:, None]
+
+
+def to_bytes(pixels: torch.Tensor) -> torch.Tensor:
+    """LeRobot's frames in 0..1 as the uint8 that they were."""
+    return pixels if pixels.dtype == torch.uint8 else (pixels * 255).round().to(torch.uint8)

@@ -1,0 +1,59 @@
+"""Give any LeRobot v3.0 dataset dynamics columns, derived from its state or from what moves in its frames.
+
+    python recipes/add_dynamics.py --dataset user/name --columns 0,1,2 --angles 2 --output datasets/name
+    python recipes/add_dynamics.py --dataset user/name --track --output datasets/name
+
+`dynamics.position`, `.velocity` and `.acceleration` are what the world models of recipes/decoupled.py and
+recipes/joint.py are supervised on. The dataset stays as it is; the new one appears when it is whole.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from dynmap_rl.runs import run_recipe
+
+
+@dataclass
+class Config:
+    # Dataset: a folder or a hub id.
+    dataset: str | None = None
+    # Folder of the new dataset.
+    output: Path | None = None
+    # Column whose entries are positions, and which of its entries (0,1,2); by default all.
+    state: str = "observation.state"
+    columns: str | None = None
+    # Those of the entries that are angles and jump by a period, and the period: 6.2832 (rad) or 360 (degrees).
+    angles: str | None = None
+    period: float = 6.283185307179586
+    # Derivatives: central (differences over both neighbours) or savgol (for noisy positions at even timestamps), with
+    # the steps of its window and the order of its polynomial.
+    method: str = "central"
+    window: int = 11
+    order: int = 3
+    # Take positions from the frames instead: the centroid, in pixels, of what moves (see dynmap_rl/data/tracking.py for
+    # what it cannot do); in which camera, by default the first; and how much of 255 a pixel must change.
+    track: bool = False
+    camera: str | None = None
+    threshold: int = 30
+    # Replace dynamics columns that are there, and say how far the new ones are from them.
+    replace: bool = False
+
+
+def main(config: Config) -> None:
+    from dynmap_rl.data import add_dynamics, parse_entries
+
+    if not config.dataset or not config.output:
+        raise ValueError("name the dataset with --dataset and the new folder with --output")
+    settings = vars(config) | {
+        "columns": parse_entries(config.columns, "--columns"),
+        "angles": parse_entries(config.angles, "--angles") or [],
+    }
+    differences = add_dynamics(**settings)
+    print(f"done: {config.output}")
+    for quantity, difference in differences.items():
+        entries = ", ".join(f"{value:.3g}" for value in difference)
+        print(f"  {quantity} differs from the column that was there by {entries} on average")
+
+
+if __name__ == "__main__":
+    run_recipe(main, Config)

@@ -1,0 +1,148 @@
+"""Train PPO on the latents of a frozen world model, and compare it with PPO on states.
+
+    python recipes/latent_ppo.py --world_model runs/decoupled/balance_reaching/position_velocity_recurrent
+
+The policy reads latent, hidden states and goal, what imitating policies read, where the expert of
+``recipes/expert.py`` reads the simulator's state; all else is the same: network, actions (accelerations), algorithm and
+settings. Both are judged on the same fresh scenes. The same command on the same folder goes on where it was stopped, or
+says that it is done.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from dynmap_rl.runs import run_recipe
+
+
+@dataclass
+class Config:
+    # Run folder whose world model is taken, of recipes/decoupled.py or joint.py; of another task too.
+    world_model: Path | None = None
+    # Name of the task: balance_reaching, balance_reaching_obstacle, bin_dropping, or module:Class of your own.
+    task: str = "balance_reaching"
+    # Folder of the checkpoints of the expert to compare with; by default the one that ships for the task.
+    expert: str | None = None
+    # Run folder; by default runs/latent_ppo/TASK.
+    run: Path | None = None
+    seed: int = 0
+    # Worlds stepped together; each iteration runs one episode's length in all of them.
+    num_envs: int = 64
+    iterations: int = 90
+    # Passes over each iteration's frames.
+    epochs: int = 10
+    minibatch: int = 1024
+    learning_rate: float = 5e-4
+    gamma: float = 0.97
+    gae_lambda: float = 0.95
+    clip: float = 0.2
+    entropy: float = 1e-3
+    # Width of the network's hidden layers.
+    hidden: int = 128
+    # Iterations between checkpoints.
+    checkpoint_every: int = 10
+    # Fresh scenes on which each checkpoint is judged, with the policy's mean.
+    eval_episodes: int = 200
+    # Fresh scenes for the last checkpoint, and for the expert.
+    final_episodes: int = 1000
+    # Every stage in a minimal size, for tests.
+    smoke: bool = False
+    threads: int = 2
+
+
+SMOKE = {
+    "num_envs": 4, "iterations": 2, "epochs": 1, "minibatch": 240, "checkpoint_every": 1, "eval_episodes": 3,
+    "final_episodes": 4, "hidden": 16,
+}  # fmt: skip
+
+
+def main(config: Config) -> None:
+    import torch
+
+    from dynmap_rl import experts, frozen, runs
+    from dynmap_rl.envs.tasks import get_task
+    from dynmap_rl.envs.world import ACCELERATION_LIMIT
+    from dynmap_rl.experts.ppo import fresh_scenes, rates, train_ppo
+    from dynmap_rl.training import fingerprint
+
+    if config.smoke:
+        runs.replace_defaults(config, SMOKE)
+    if config.world_model is None:
+        raise ValueError(
+            "--world_model is the run folder of a world model; train one with recipes/decoupled.py"
+        )
+    task = get_task(config.task)
+    world_model, source = frozen.load_source(config.world_model)
+    world_model.requires_grad_(False)
+    expert = experts.load_expert(config.expert or config.task)
+    folder = config.run or Path("runs/latent_ppo") / f"{task.name}{'_smoke' if config.smoke else ''}"
+    folder = runs.open_run(folder, config, ignore=("run", "iterations", "threads"))
+    if (folder / "eval.json").exists():
+        print(f"{folder} is done; delete it to run again")
+        return print_result(runs.read_json(folder / "eval.json"))
+    torch.set_num_threads(config.threads)
+
+    frozen_weights = fingerprint(world_model)
+    env = make_env(world_model, config.task, config.num_envs)
+    size = env.observation_spec["state"].shape[-1]
+    runs.seed_everything(config.seed)
+    network = experts.ExpertNetwork(size, tuple(ACCELERATION_LIMIT), config.hidden)
+
+    def judge(episodes: int) -> dict[str, float]:
+        return rates(task, roll_out(network, world_model, config.task, fresh_scenes(episodes)))
+
+    facts = {"task": config.task, "state_size": size, "hidden": config.hidden}
+    facts["acceleration_limit"] = ACCELERATION_LIMIT.tolist()
+    train_ppo(env, network, folder, config, judge, facts)
+    if fingerprint(world_model) != frozen_weights:
+        raise ValueError("the frozen world model has changed; this run is not valid")
+    states = rates(task, experts.roll_out(expert, task, fresh_scenes(config.final_episodes)))
+    result = {
+        "task": config.task,
+        "world_model_of": source,
+        "supervision": list(world_model.supervision),
+        "world_model_sha256": frozen_weights,
+        "latents": runs.read_json(folder / "checkpoint" / f"iteration_{config.iterations:03d}.json"),
+        "states": states | {"expert": config.expert or config.task},
+        "command": runs.command_line(),
+    }
+    runs.write_json(folder / "eval.json", result)
+    print_result(result)
+
+
+def make_env(world_model, task: str, num_envs: int):
+    """``state`` is what the world model makes of the frames, and the goal; frames themselves are not kept."""
+    from torchrl.envs import CatTensors, Compose, ExcludeTransform, TransformedEnv
+
+    from dynmap_rl.envs import DynmapBatchedEnv, WorldModelTransform
+
+    env = DynmapBatchedEnv(task, num_envs, from_pixels=True, control="acceleration", pixels_only=True)
+    states = CatTensors(["latent", "hidden1", "hidden2", "goal"], "state", del_keys=False, sort=False)
+    transform = WorldModelTransform(world_model, agent_pos="agent_pos", mixed=True)
+    return TransformedEnv(env, Compose(transform, states, ExcludeTransform("pixels")))
+
+
+def roll_out(network, world_model, task: str, seeds: list[int]) -> list:
+    """Run the mean action on one scene a seed for 120 steps; the worlds are as they are at the end."""
+    import torch
+
+    from dynmap_rl.envs.world import EPISODE_STEPS
+
+    env = make_env(world_model, task, len(seeds))
+    with torch.no_grad():
+        td = env.reset(scene_seed=torch.tensor(seeds))
+        for _ in range(EPISODE_STEPS):
+            td = env.step(td.set("action", network(td["state"])[0]))["next"]
+    return env.base_env.worlds
+
+
+def print_result(result: dict) -> None:
+    for name in ("latents", "states"):
+        row = result[name]
+        print(
+            f"PPO on {name:8} success {row['success']:6.1%}   drop {row['drop']:6.1%}   "
+            f"position error {1000 * row['position_error']:.0f} mm   ({row['episodes']} scenes)"
+        )
+
+
+if __name__ == "__main__":
+    run_recipe(main, Config)

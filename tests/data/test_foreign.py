@@ -1,0 +1,147 @@
+"""Datasets of no task of ours: pieces, splits, frames and constants."""
+
+import json
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import torch
+from foreign_dataset import CAMERA, make_foreign
+
+from dynmap_rl.data import add_dynamics, load_foreign, range_constants, sample_windows
+
+LENGTHS = (31, 47, 24, 33)
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """By name: without dynamics, with them, and the same with frames in videos."""
+    root = tmp_path_factory.mktemp("foreign")
+    make_foreign(root / "plain", LENGTHS)
+    make_foreign(root / "plain_videos", LENGTHS, videos=True)
+    for name in ("plain", "plain_videos"):
+        add_dynamics(root / name, root / name.replace("plain", "dynamics"), columns=[0, 1, 2], angles=[2])
+    return root
+
+
+@pytest.fixture(scope="module")
+def splits(folders):
+    return load_foreign(folders / "dynamics", 20)
+
+
+def column(root, name):
+    [path] = (root / "data").rglob("*.parquet")
+    return np.array(pq.read_table(path)[name].to_pylist(), np.float32)
+
+
+def test_shapes_are_those_of_the_data(splits):
+    # The shortest episode has 24 steps; 31, 47 and 24 steps are covered by 2, 2 and 1 pieces, 33 by 2.
+    assert (splits["train"].shape, splits["eval"].shape) == ((5, 24), (2, 24))
+    train = splits["train"]
+    assert train["pixels"].shape == (5, 24, 3, 64, 64) and train["pixels"].dtype == torch.uint8
+    assert (train["action"].shape[-1], train["goal"].shape[-1]) == (2, 0)
+    assert train["dynamics", "velocity"].shape == (5, 24, 3)
+    assert train["action"].dtype == train["dynamics", "position"].dtype == torch.float32
+
+
+def test_pieces_cover_every_step_of_their_episode_and_no_other(folders, splits):
+    position, start = column(folders / "dynamics", "dynamics.position"), 0
+    everything = torch.cat([splits["train"], splits["eval"]])
+    for episode, length in enumerate(LENGTHS):
+        own = torch.from_numpy(position[start : start + length])
+        found = everything[(everything["episode"] == episode).all(1).flatten()]["dynamics", "position"]
+        places = [[int((own == row).all(1).nonzero()[0]) for row in piece] for piece in found]
+        assert all(piece == list(range(piece[0], piece[0] + 24)) for piece in places)
+        assert {t for piece in places for t in piece} == set(range(length))
+        start += length
+
+
+def test_no_window_crosses_a_border(splits):
+    windows = sample_windows(splits["train"], 64, 10, torch.Generator().manual_seed(0))
+    assert (windows["episode"] == windows["episode"][:, :1]).all()
+    # The squares glide evenly: a step over a border would be longer.
+    steps = windows["dynamics", "position"].diff(dim=1)[..., :2]
+    assert (steps - steps[:, :1]).abs().max() < 1e-5
+
+
+def test_no_episode_is_in_both_splits(splits):
+    train, held_out = (set(splits[name]["episode"].flatten().tolist()) for name in ("train", "eval"))
+    assert (train, held_out) == ({0, 1, 2}, {3})
+
+
+def test_splits_that_the_dataset_names_are_kept(folders, tmp_path):
+    root = make_foreign(tmp_path / "named", (12, 12, 12))
+    path = root / "meta/info.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"splits": {"eval": "0:1", "train": "1:3"}}))
+    splits = load_foreign(root, 5)
+    assert splits["eval"]["episode"].unique().tolist() == [0]
+    assert splits["train"]["episode"].unique().tolist() == [1, 2]
+
+
+def test_episodes_that_are_too_short_are_left_out_and_long_ones_cut(tmp_path):
+    root = make_foreign(tmp_path / "lengths", (130, 8, 125))
+    splits = load_foreign(root, 20)
+    assert splits["train"].shape == (2, 120)
+    with pytest.raises(ValueError, match="has 1 episodes of at least 128 steps, and two are needed"):
+        load_foreign(root, 128)
+
+
+def test_frames_are_resized_by_area_and_keep_their_colours(splits):
+    frames = splits["train"]["pixels"][0, 0]
+    assert frames[:, 0, 0].tolist() == [190] * 3
+    red = (frames[0].int() - frames[1] > 100).float()
+    assert red.any(), "red, not blue"
+    y, x = red.nonzero().float().mean(0)
+    position = splits["train"]["dynamics", "position"][0, 0]
+    assert abs((x + 0.5) / 64 - position[0]) < 0.03 and abs((y + 0.5) / 64 - position[1]) < 0.03
+
+
+def test_videos_give_nearly_the_frames_of_images(folders, splits):
+    videos = load_foreign(folders / "dynamics_videos", 20)["train"]
+    assert (videos["pixels"].float() - splits["train"]["pixels"]).abs().mean() < 2
+    assert torch.equal(videos["action"], splits["train"]["action"])
+
+
+def test_a_goal_of_chosen_entries(folders):
+    train = load_foreign(folders / "plain", 20, goal="observation.state:3,0")["train"]
+    assert train["goal"].shape == (5, 24, 2)
+    assert (train["goal"][..., 0] == 0).all()
+    assert train["goal"][0, 0, 1].item() == column(folders / "plain", "observation.state")[0, 0]
+    assert "dynamics" not in train.keys()
+
+
+def test_constants_are_the_ranges_and_a_still_entry_gets_one(folders, splits):
+    constants = range_constants(splits["train"])
+    assert constants.keys() == {"action", "goal", "position", "velocity", "acceleration"}
+    for key in ("action", ("dynamics", "position")):
+        values = splits["train"][key].flatten(0, 1)
+        name = key if key == "action" else "position"
+        low, high = torch.tensor(constants[name]["low"]), torch.tensor(constants[name]["high"])
+        assert (((values - low) / (high - low) - 0.5).abs() < 0.53).all()
+        assert (high - low <= values.amax(0) - values.amin(0) + 1e-6).all()
+    goals = load_foreign(folders / "plain", 20, goal="observation.state:3")["train"]
+    assert range_constants(goals)["goal"] == {"low": [-0.5], "high": [0.5]}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"camera": "front"}, f"no camera 'front'; choose --camera from {CAMERA}"),
+        ({"goal": "observation.state"}, "--goal: after the colon are whole numbers"),
+        ({"goal": "nothing:1"}, "--goal is a column of numbers and its entries"),
+        ({"goal": "observation.state:4"}, "observation.state has the entries 0 to 3"),
+    ],
+)
+def test_what_is_not_there_is_named(folders, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        load_foreign(folders / "plain", 20, **arguments)
+
+
+def test_a_damaged_video_is_named(folders, tmp_path):
+    import shutil
+
+    root = shutil.copytree(folders / "plain_videos", tmp_path / "copy")
+    [path] = root.rglob("*.mp4")
+    path.write_bytes(path.read_bytes()[:500])
+    with pytest.raises(ValueError, match=f"{path} cannot be decoded"):
+        load_foreign(root, 20)

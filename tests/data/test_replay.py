@@ -1,0 +1,63 @@
+"""Episodes as a TorchRL replay buffer."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from dynmap_rl.data import as_replay_buffer, load_dataset
+from dynmap_rl.envs import WorldModelTransform
+from dynmap_rl.modules import make_world_model
+from dynmap_rl.objectives import WorldModelLoss
+
+CONSTANTS = {
+    "action": {"low": [-0.02, -0.02, -0.05], "high": [0.02, 0.02, 0.05]},
+    "position": {"low": [0.0] * 6, "high": [1.0] * 6},
+}
+
+
+@pytest.fixture
+def episodes() -> TensorDict:
+    """Five episodes of eight steps; every step has its own number, and the flags of its end are not all at the end."""
+    number = torch.arange(40).reshape(5, 8, 1)
+    done = number % 8 >= 5
+    return TensorDict({"number": number, "next": {"done": done}}, [5, 8])
+
+
+def test_samples_are_windows_of_one_episode_each(episodes):
+    buffer = as_replay_buffer(episodes, batch=200, length=3, generator=torch.Generator().manual_seed(0))
+    sample = buffer.sample()
+    assert sample.shape == (200, 3)
+    number = sample["number"].squeeze(-1)
+    assert (number.diff(dim=1) == 1).all()
+    assert (number // 8 == sample["episode"]).all()
+    assert set(number[:, 0].tolist()) == {8 * e + t for e in range(5) for t in range(6)}, "every place"
+    assert torch.equal(sample["next", "done"], number.unsqueeze(-1) % 8 >= 5), "flags are as they were"
+
+
+def test_sampling_again_and_whole_episodes(episodes):
+    buffer = as_replay_buffer(episodes, batch=2, length=8)
+    for _ in range(3):
+        number = buffer.sample()["number"].squeeze(-1)
+        assert (number % 8 == torch.arange(8)).all()
+    assert set(episodes.keys()) == {"number", "next"}, "the episodes are left as they are"
+    with pytest.raises(ValueError, match="windows of 9 steps do not fit into episodes of 8"):
+        as_replay_buffer(episodes, batch=2, length=9)
+
+
+def test_the_generator_decides(episodes):
+    def draw(seed):
+        return as_replay_buffer(episodes, 16, 3, torch.Generator().manual_seed(seed)).sample()["number"]
+
+    assert torch.equal(draw(0), draw(0)) and not torch.equal(draw(0), draw(1))
+
+
+def test_demonstrations_feed_a_loss_and_a_world_model(recording):
+    episodes = load_dataset(recording, "train")
+    model = make_world_model(CONSTANTS, ("position",), latent_size=16, hidden_size=24)
+    buffer = as_replay_buffer(episodes, batch=2, length=5)
+    assert WorldModelLoss(model)(buffer.sample())["loss_rgb"] > 0
+    buffer.append_transform(WorldModelTransform(model))
+    sample = buffer.sample()
+    assert sample["latent"].shape == (2, 5, 16) and sample["hidden2"].shape == (2, 5, 24)
+    row, time = sample["index"][1].long() // 120, sample["index"][1].long() % 120
+    assert torch.equal(episodes["pixels"][row, time], sample["pixels"][1])

@@ -1,0 +1,186 @@
+"""The world model as an environment, against its own step form; and its open-loop error."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.envs import Compose, InitTracker, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from dynmap_rl.data import load_dataset
+from dynmap_rl.envs import ImaginationEnv, make_start
+from dynmap_rl.evaluation import open_loop_errors
+from dynmap_rl.modules import MEMORY, LatentActor, make_policy, make_policy_module, make_world_model
+
+CONSTANTS = {
+    "action": {"low": [-0.02, -0.02, -0.05], "high": [0.02, 0.02, 0.05]},
+    "goal": {"low": [0.0, 0.0], "high": [1.0, 1.0]},
+    **{name: {"low": [0.0] * 6, "high": [1.0] * 6} for name in ("position", "velocity")},
+}
+B = 3
+
+
+def make_model(supervision=("position", "velocity")):
+    torch.manual_seed(0)
+    return make_world_model(CONSTANTS, supervision, latent_size=16, hidden_size=24).eval()
+
+
+@pytest.fixture
+def frames() -> TensorDict:
+    generator = torch.Generator().manual_seed(0)
+    pixels = torch.randint(0, 256, (B, 4, 3, 64, 64), dtype=torch.uint8, generator=generator)
+    action = 0.01 * torch.randn(B, 4, 3, generator=generator)
+    goal = torch.rand(B, 1, 2, generator=generator).expand(B, 4, 2)
+    return TensorDict({"pixels": pixels, "action": action, "goal": goal}, [B, 4])
+
+
+@torch.no_grad()
+def test_the_start_is_where_the_world_model_is_after_the_frames(frames):
+    model, start = make_model(), make_start(make_model(), frames)
+    latent = model.encode(frames["pixels"])
+    predicted, hidden1, hidden2 = model.predict(latent, frames["action"])
+    expected = {"latent": latent, "predicted_latent": predicted, "hidden1": hidden1, "hidden2": hidden2}
+    for key, value in expected.items():
+        torch.testing.assert_close(start[key], value[:, -1], rtol=1e-5, atol=1e-5)
+    assert torch.equal(start["goal"], frames["goal"][:, -1]) and "pixels" not in start
+    first = make_start(model, frames[:, :1])
+    assert all((first[key] == 0).all() for key in ("predicted_latent", *MEMORY))
+
+
+def reward(td):
+    return -(td["predicted_dynamics", "position"][:, :2] - td["goal"]).norm(dim=-1, keepdim=True)
+
+
+@pytest.mark.parametrize(
+    "arguments", [{}, {"decode_pixels": True}, {"reward": reward, "decode_pixels": True}], ids=str
+)
+def test_specs(frames, arguments):
+    env = ImaginationEnv(make_model(), make_start(make_model(), frames), **arguments)
+    check_env_specs(env)
+    assert (("reconstruction", "pixels") in env.rollout(1).keys(True)) is ("decode_pixels" in arguments)
+    bare = TensorDict({"latent": torch.zeros(B, 16)}, [B])
+    check_env_specs(ImaginationEnv(make_model(()), bare, arguments.get("decode_pixels", False)))
+
+
+@torch.no_grad()
+def test_a_step_feeds_the_prediction_back_and_decodes_it(frames):
+    model, start = make_model(), make_start(make_model(), frames)
+    out = ImaginationEnv(model, start, decode_pixels=True, reward=reward).rollout(6)
+    latent, memory = start["latent"], tuple(start[key] for key in MEMORY)
+    for t in range(6):
+        latent, memory = model.step(latent, out["action"][:, t], memory)
+        after = out[:, t]["next"]
+        torch.testing.assert_close(after["latent"], latent)
+        torch.testing.assert_close(after["predicted_latent"], latent)
+        for key, value in zip(MEMORY, memory, strict=True):
+            torch.testing.assert_close(after[key], value)
+        states = latent, memory[0], memory[2]
+        for quantity, value in model.decode_dynamics(*states).items():
+            torch.testing.assert_close(after["predicted_dynamics", quantity], value)
+        torch.testing.assert_close(after["reconstruction", "pixels"], model.decode_pixels(*states))
+        torch.testing.assert_close(after["reward"], reward(after))
+        assert torch.equal(after["goal"], start["goal"]) and not after["done"].any()
+    assert torch.equal(out["latent"][:, 1:], out["next", "latent"][:, :-1])
+
+
+def test_no_reward_is_predicted(frames):
+    out = ImaginationEnv(make_model(), make_start(make_model(), frames)).rollout(3)
+    assert (out["next", "reward"] == 0).all()
+
+
+def test_resets_go_to_the_start_or_where_they_are_told(frames):
+    env = ImaginationEnv(make_model(), make_start(make_model(), frames))
+    start = env.reset()
+    td = env.rollout(4)[:, -1]["next"].exclude("reward")
+    part = env.reset(td.clone().set("_reset", torch.tensor([[True], [False], [False]])), set_state=False)
+    assert torch.equal(part["latent"][0], start["latent"][0])
+    assert torch.equal(part["latent"][1:], td["latent"][1:])
+    elsewhere = make_start(make_model(), frames[:, :2])
+    assert torch.equal(env.reset(elsewhere.clone(), set_state=True)["hidden2"], elsewhere["hidden2"])
+    assert torch.equal(env.reset()["hidden2"], start["hidden2"])
+
+
+@pytest.mark.parametrize("kind", ["feedforward", "recurrent"])
+def test_policies_act_in_it(frames, kind):
+    model = make_model()
+    actor = LatentActor(make_policy(CONSTANTS, kind, model, width=20))
+    env = ImaginationEnv(model, make_start(model, frames), reward=reward)
+    env = TransformedEnv(env, Compose(InitTracker(), actor.make_tensordict_primer()))
+    check_env_specs(env)
+    with torch.no_grad():
+        out = env.rollout(7, actor)
+    assert out.shape == (B, 7) and not out["is_init"][:, 1:].any()
+    sequence = make_policy_module(actor.policy)(out.select("latent", "hidden1", "hidden2", "goal"))
+    torch.testing.assert_close(out["action"], sequence["action"], rtol=1e-3, atol=1e-6)
+    collector = Collector(env, actor, frames_per_batch=6 * B, total_frames=12 * B)
+    assert [batch.shape for batch in collector] == [(B, 6)] * 2
+    collector.shutdown()
+
+
+def test_a_reward_s_gradient_reaches_the_policy_through_the_steps(frames):
+    model = make_model()
+    actor = LatentActor(make_policy(CONSTANTS, "feedforward", model, width=20))
+    out = ImaginationEnv(model, make_start(model, frames), reward=reward).rollout(5, actor)
+    out["next", "reward"].sum().backward()
+    assert all(p.grad.abs().sum() > 0 for p in actor.policy.parameters())
+
+
+def test_a_start_of_another_form_is_refused():
+    for start in (TensorDict({}, [B]), TensorDict({"latent": torch.zeros(B, 9)}, [B])):
+        with pytest.raises(ValueError, match=r"start must be a TensorDict \[B\] with latent \[B, 16\]"):
+            ImaginationEnv(make_model(), start)
+
+
+class Perfect(torch.nn.Module):
+    """Knows the scene: latents are true positions of the cart, which follows its actions, and of a resting block."""
+
+    supervision, latent_size = ("position",), 6
+
+    def __init__(self, position: torch.Tensor):
+        super().__init__()
+        self.position, self.transition = position, torch.nn.Module()
+        self.constant = torch.nn.Parameter(torch.zeros(1))
+
+    def encode(self, pixels, mixed=False):
+        return self.position[:, : pixels.shape[1]]
+
+    def step(self, latent, action, state):
+        return latent + torch.cat([action, torch.zeros_like(action)], -1), state
+
+    def initial_state(self, batch, device=None):
+        return (torch.zeros(batch, 1),) * 4
+
+    def decode_dynamics(self, predicted, hidden1, hidden2):
+        return {"position": predicted}
+
+
+def test_open_loop_errors_are_distances_in_mm_and_angles_in_degrees():
+    """A scene whose block slides off by 1 mm and 0.01 rad a step, which the model does not know."""
+    generator = torch.Generator().manual_seed(0)
+    action = 0.01 * torch.randn(2, 20, 3, generator=generator)
+    cart = torch.cat([torch.zeros(2, 1, 3), action[:, :-1].cumsum(1)], 1)
+    block = torch.arange(20.0)[None, :, None] * torch.tensor([0.0006, 0.0008, 0.01]).expand(2, 1, 3)
+    position = torch.cat([cart, block], -1)
+    data = {"action": action, "pixels": torch.zeros(2, 20, 1), "dynamics": {"position": position}}
+    errors = open_loop_errors(Perfect(position), TensorDict(data, [2, 20]), context=5, horizon=8)
+    assert (errors["context"], errors["episodes"]) == (5, 2)
+    steps = torch.arange(1.0, 9.0)
+    close = {"rtol": 1e-3, "atol": 1e-3}
+    torch.testing.assert_close(torch.tensor(errors["model"]["cart_mm"]), torch.zeros(8), **close)
+    torch.testing.assert_close(torch.tensor(errors["model"]["block_mm"]), steps, **close)
+    torch.testing.assert_close(torch.tensor(errors["model"]["block_deg"]), steps * 0.572958, **close)
+    torch.testing.assert_close(torch.tensor(errors["still"]["block_mm"]), steps, **close)
+    moved = (cart[:, 5:13, :2] - cart[:, 4:5, :2]).norm(dim=-1).mean(0) * 1000
+    torch.testing.assert_close(torch.tensor(errors["still"]["cart_mm"]), moved, **close)
+
+
+def test_open_loop_errors_on_demonstrations(recording):
+    episodes = load_dataset(recording, "eval")
+    errors = open_loop_errors(make_model(), episodes, context=3, horizon=4, batch=1)
+    together = open_loop_errors(make_model(), episodes, context=3, horizon=4)
+    assert errors["model"]["cart_mm"] == pytest.approx(together["model"]["cart_mm"], rel=1e-3)
+    assert all(len(column) == 4 for name in ("model", "still") for column in errors[name].values())
+    with pytest.raises(ValueError, match="not supervised on position"):
+        open_loop_errors(make_model(()), episodes)
+    with pytest.raises(ValueError, match=r"100 \+ 40 steps do not fit into episodes of 120"):
+        open_loop_errors(make_model(), episodes, context=100)

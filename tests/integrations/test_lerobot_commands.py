@@ -1,0 +1,182 @@
+"""LeRobot's own commands, as its users type them. One starts as a process of its own, the others in this one, for
+LeRobot takes long to import."""
+
+import importlib
+import json
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from dynmap_rl.data import load_dataset
+
+PLUGIN = "discover_packages_path=dynmap_rl.integrations.lerobot"
+DISTRIBUTION = Path(__file__).parents[2] / "dynmap_rl/integrations/lerobot_policy_dynmap"
+TASKS = ("balance_reaching", "balance_reaching_obstacle", "bin_dropping")
+QUICK = ["--batch_size=2", "--log_freq=1", "--num_workers=0", "--env_eval_freq=0"]
+SMALL = {
+    "dynmap": ["--policy.window_steps=6", "--policy.rgb_steps=2"],
+    "act": [
+        "--policy.pretrained_backbone_weights=null",
+        "--policy.dim_model=16",
+        "--policy.n_heads=2",
+        "--policy.dim_feedforward=16",
+        "--policy.n_encoder_layers=1",
+        "--policy.n_vae_encoder_layers=1",
+        "--policy.chunk_size=30",
+        "--policy.n_action_steps=30",
+    ],
+    "diffusion": [
+        "--policy.pretrained_backbone_weights=null",
+        "--policy.down_dims=[16,32]",
+        "--policy.horizon=32",
+        "--policy.n_action_steps=30",
+        "--policy.num_inference_steps=1",
+    ],
+}
+
+
+@pytest.fixture
+def lerobot(monkeypatch):
+    """Run ``lerobot-NAME`` in this process."""
+
+    def run(name, *arguments):
+        script = importlib.import_module(f"lerobot.scripts.lerobot_{name.replace('-', '_')}")
+        monkeypatch.setattr(sys, "argv", [f"lerobot-{name}", *map(str, arguments)])
+        script.main()
+
+    threads = torch.get_num_threads()
+    yield run
+    torch.set_num_threads(threads)
+
+
+def train_arguments(kind, dataset, output, steps):
+    return [
+        f"--policy.type={kind}",
+        "--policy.device=cpu",
+        "--policy.push_to_hub=false",
+        *SMALL[kind],
+        "--dataset.repo_id=user/small",
+        f"--dataset.root={dataset}",
+        "--dataset.use_imagenet_stats=false",
+        f"--output_dir={output}",
+        f"--steps={steps}",
+        *QUICK,
+    ]
+
+
+def evaluate(lerobot, path, task, output):
+    lerobot(
+        "eval",
+        f"--env.{PLUGIN}",
+        f"--policy.path={path}",
+        "--policy.device=cpu",
+        "--env.type=dynmap",
+        f"--env.task={task}",
+        "--eval.n_episodes=1",
+        "--eval.batch_size=1",
+        "--seed=3",
+        f"--output_dir={output}",
+    )
+    return json.loads((output / "eval_info.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def trained(recording, tmp_path_factory):
+    """Four steps of ``lerobot-train``, with checkpoints after two and four: its folder, and what it printed."""
+    output = tmp_path_factory.mktemp("lerobot") / "train"
+    command = [Path(sys.executable).with_name("lerobot-train"), f"--policy.{PLUGIN}", "--save_freq=2"]
+    command += [*train_arguments("dynmap", recording, output, 4), "--env.type=dynmap"]
+    # Nothing random in a step: LeRobot restores torch's generator, but then draws from it for its loader.
+    command += ["--policy.recolor=false", "--policy.rgb_steps=6"]
+    environment = os.environ | {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return output, done.stderr + done.stdout
+
+
+def test_train_supervises_on_the_dynamics(trained):
+    output, printed = trained
+    for term in ("rgb", "latent", "position", "velocity", "policy"):
+        assert f"loss_{term}:" in printed
+    names = {path.name for path in (output / "checkpoints/last/pretrained_model").iterdir()}
+    assert {"config.json", "model.safetensors", "policy_preprocessor.json"} <= names
+
+
+def test_resuming_gives_the_weights_of_the_uninterrupted_run(trained, lerobot):
+    output, _ = trained
+    path = output / "checkpoints/000004/pretrained_model/model.safetensors"
+    whole = load_file(path)
+    path.unlink()
+    config = output / "checkpoints/000002/pretrained_model/train_config.json"
+    lerobot("train", f"--policy.{PLUGIN}", f"--config_path={config}", "--resume=true")
+    resumed = load_file(path)
+    assert whole.keys() == resumed.keys()
+    for name, value in whole.items():
+        torch.testing.assert_close(resumed[name], value, rtol=0, atol=1e-6)
+
+
+def test_eval_plays_the_policy(trained, lerobot, tmp_path):
+    info = evaluate(
+        lerobot, trained[0] / "checkpoints/last/pretrained_model", "bin_dropping", tmp_path / "eval"
+    )
+    assert info["overall"]["n_episodes"] == 1
+    assert info["overall"]["pc_success"] == 0.0
+    (video,) = info["overall"]["video_paths"]
+    assert Path(video).stat().st_size > 1000
+
+
+@pytest.mark.parametrize("kind", ["act", "diffusion"])
+def test_policies_of_lerobot_train_on_our_data_and_play_our_tasks(kind, recording, lerobot, tmp_path):
+    output = tmp_path / "train"
+    lerobot("train", *train_arguments(kind, recording, output, 1))
+    for task in TASKS:
+        info = evaluate(lerobot, output / "checkpoints/last/pretrained_model", task, tmp_path / task)
+        assert info["overall"]["n_episodes"] == 1
+
+
+def test_edited_datasets_stay_datasets_that_can_be_trained_on(recording, lerobot, tmp_path):
+    common = ["--repo_id=user/small", f"--root={recording}", "--new_repo_id=user/edited"]
+    edited = tmp_path / "edited"
+    operation = ["--operation.type=delete_episodes", "--operation.episode_indices=[0, 3]"]
+    lerobot("edit-dataset", *common, f"--new_root={edited}", *operation)
+    kept = load_dataset(recording)[[1, 2, 4, 5]]
+    after = load_dataset(edited)
+    for key in ("pixels", "agent_pos", "action", "dynamics"):
+        assert (after[key] == kept[key]).all()
+    lerobot("train", *train_arguments("dynmap", edited, tmp_path / "train", 1))
+
+    bare = tmp_path / "bare"
+    operation = ["--operation.type=remove_feature", "--operation.feature_names=['dynamics.velocity']"]
+    lerobot("edit-dataset", *common, f"--new_root={bare}", *operation)
+    with pytest.raises(ValueError, match=r"lacks the columns dynamics\.velocity"):
+        lerobot("train", *train_arguments("dynmap", bare, tmp_path / "bare_train", 1))
+
+
+def test_viewer_takes_an_episode(recording, lerobot, tmp_path):
+    pytest.importorskip("rerun")
+    arguments = ["--repo-id=user/small", f"--root={recording}", "--episode-index=1", "--num-workers=0"]
+    lerobot("dataset-viz", *arguments, "--save=1", f"--output-dir={tmp_path}")
+    assert (tmp_path / "user_small_episode_1.rrd").stat().st_size > 10_000
+
+
+def test_lerobot_finds_the_installed_distribution(tmp_path):
+    project = tomllib.loads((DISTRIBUTION / "pyproject.toml").read_text())["project"]
+    assert (DISTRIBUTION / f"{project['name']}.py").exists()
+    info = tmp_path / f"{project['name']}-{project['version']}.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Name: {project['name']}\nVersion: {project['version']}\n")
+    code = (
+        "from lerobot.utils.import_utils import register_third_party_plugins as register; register();"
+        "from lerobot.configs import PreTrainedConfig; from lerobot.envs import EnvConfig;"
+        "print('dynmap' in PreTrainedConfig.get_known_choices(), 'dynmap' in EnvConfig.get_known_choices())"
+    )
+    path = os.pathsep.join([str(tmp_path), str(DISTRIBUTION), str(Path(__file__).parents[2])])
+    environment = os.environ | {"PYTHONPATH": path}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert done.stdout.split() == ["True", "True"], done.stderr[-2000:]

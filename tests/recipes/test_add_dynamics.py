@@ -1,0 +1,213 @@
+"""The add_dynamics recipe: the columns, their statistics, and a new folder that is whole or absent."""
+
+import json
+import os
+import subprocess
+import sys
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import torch
+from foreign_dataset import CAMERA, FPS, make_foreign
+
+from dynmap_rl.data import load_dataset
+from recipes.add_dynamics import Config, main
+
+RECIPE = Path(__file__).parents[2] / "recipes" / "add_dynamics.py"
+QUANTITIES = ("position", "velocity", "acceleration")
+LENGTHS = (31, 47, 24, 33)
+
+
+def run(folder, *arguments):
+    command = [sys.executable, str(RECIPE), *arguments]
+    return subprocess.run(command, cwd=folder, env=os.environ, capture_output=True, text=True)
+
+
+def make_pair(folder, videos):
+    source, output = make_foreign(folder / "source", LENGTHS, videos), folder / "output"
+    main(Config(dataset=str(source), output=output, columns="0,1,2", angles="2"))
+    return source, output
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory):
+    return make_pair(tmp_path_factory.mktemp("images"), videos=False)
+
+
+@pytest.fixture(scope="module")
+def videos(tmp_path_factory):
+    return make_pair(tmp_path_factory.mktemp("videos"), videos=True)
+
+
+@pytest.fixture(params=["images", "videos"])
+def pair(request):
+    """A foreign dataset, and the one with dynamics of x, y and the angle."""
+    return request.getfixturevalue(request.param)
+
+
+def open_with_lerobot(root):
+    from dynmap_rl.data.writing import quiet
+
+    with quiet():
+        from lerobot.datasets import LeRobotDataset
+
+        return LeRobotDataset("test/foreign", root=root, video_backend="pyav")
+
+
+def read(root, column):
+    tables = [
+        pq.read_table(path, columns=["index", column]) for path in sorted((root / "data").rglob("*.parquet"))
+    ]
+    return np.concatenate([np.array(t[column].to_pylist(), np.float64) for t in tables])
+
+
+def test_lerobot_reads_it_and_nothing_else_has_changed(pair):
+    before, after = map(open_with_lerobot, pair)
+    assert len(after) == len(before) == sum(LENGTHS)
+    new = {f"dynamics.{q}" for q in QUANTITIES}
+    assert after.meta.features.keys() - before.meta.features.keys() == new
+    assert after.meta.features["dynamics.velocity"]["names"] == ["x", "y", "angle"]
+    for i in (0, 30, 31, 134):
+        old, item = before[i], after[i]
+        assert item.keys() - old.keys() == new
+        assert item["dynamics.velocity"].shape == (3,)
+        assert all(
+            torch.equal(item[k], old[k]) if torch.is_tensor(old[k]) else item[k] == old[k] for k in old
+        )
+
+
+def test_the_hub_reads_the_tables(pair):
+    import datasets
+
+    [path] = (pair[1] / "data").rglob("*.parquet")
+    assert "dynamics.acceleration" in datasets.Features.from_arrow_schema(pq.read_schema(path))
+    described = json.loads(pq.read_schema(path).metadata[b"huggingface"])["info"]["features"]
+    assert list(described) == pq.read_schema(path).names
+    assert pq.ParquetFile(path).num_row_groups == len(LENGTHS)
+
+
+def test_files_of_frames_are_the_same(pair):
+    source, output = pair
+    videos = list((source / "videos").rglob("*.mp4"))
+    for path in videos:
+        assert (output / path.relative_to(source)).read_bytes() == path.read_bytes()
+    if not videos:
+        [a], [b] = (list((root / "data").rglob("*.parquet")) for root in pair)
+        assert pq.read_table(a)[CAMERA].equals(pq.read_table(b)[CAMERA])
+
+
+def test_angles_are_unwrapped_and_episodes_do_not_mix(pair):
+    state = read(pair[0], "observation.state")
+    position, velocity, acceleration = (read(pair[1], f"dynamics.{q}") for q in QUANTITIES)
+    assert np.abs(np.diff(state[:, 2])).max() > 6, "the angle jumps"
+    borders = np.cumsum([0, *LENGTHS])
+    for start, end in pairwise(borders):
+        # Every square glides and turns at a speed of its own, to its first and its last step.
+        own = velocity[start:end]
+        assert np.abs(own - own.mean(0)).max() < 1e-4
+        rate = (position[end - 1] - position[start]) * FPS / (end - 1 - start)
+        assert np.abs(own.mean(0) - rate).max() < 1e-4
+        assert np.abs(np.diff(position[start:end, 2])).max() < 0.2
+    assert np.abs(acceleration).max() < 5e-3  # of states that are float32
+    assert np.abs(position[:, :2] - state[:, :2]).max() == 0
+
+
+def test_statistics_are_those_of_the_columns(pair):
+    root = pair[1]
+    stats = json.loads((root / "meta/stats.json").read_text())
+    [episodes] = (root / "meta/episodes").rglob("*.parquet")
+    rows = pq.read_table(episodes).to_pylist()
+    borders = np.cumsum([0, *LENGTHS])
+    for quantity in QUANTITIES:
+        values = read(root, f"dynamics.{quantity}")
+        check(stats[f"dynamics.{quantity}"], values)
+        for i, row in enumerate(rows):
+            prefix = f"stats/dynamics.{quantity}/"
+            own = {key.removeprefix(prefix): value for key, value in row.items() if key.startswith(prefix)}
+            check(own, values[borders[i] : borders[i + 1]])
+    assert rows[0].keys() >= {"stats/action/mean", "tasks", "length"}
+    assert stats["action"] == json.loads((pair[0] / "meta/stats.json").read_text())["action"]
+    assert stats.keys() == open_with_lerobot(root).meta.stats.keys()
+
+
+def check(stats, values):
+    assert stats["count"] == [len(values)]
+    for name, function in (("mean", np.mean), ("std", np.std), ("min", np.min), ("max", np.max)):
+        assert np.allclose(stats[name], function(values, axis=0), atol=1e-6), name
+    spread = np.ptp(values, axis=0)
+    for name in ("q01", "q50", "q99"):
+        error = np.abs(stats[name] - np.quantile(values, int(name[1:]) / 100, axis=0))
+        assert (error <= 0.2 * spread + 1e-6).all(), name  # LeRobot's are those of a histogram
+
+
+def test_what_it_says_of_our_own_recordings_is_near_the_simulators_truth(recording, tmp_path, capsys):
+    """Positions are known, velocities within a tenth, accelerations, which jump every step, roughly."""
+    settings = {"dataset": str(recording), "state": "dynamics.position", "angles": "2,5"}
+    main(Config(**settings, output=tmp_path / "derived", replace=True))
+    assert "velocity differs from the column that was there by 0.00" in capsys.readouterr().out
+    truth, derived = load_dataset(recording), load_dataset(tmp_path / "derived")
+    assert set(truth.keys(True, True)) == set(derived.keys(True, True))
+    for quantity, bound in (("position", 1e-6), ("velocity", 0.12), ("acceleration", 0.7)):
+        a, b = truth["dynamics", quantity][..., :2], derived["dynamics", quantity][..., :2]
+        assert (a - b).abs().mean() < bound * a.abs().mean(), quantity
+    assert torch.equal(truth["pixels"], derived["pixels"])
+
+
+def test_positions_from_the_picture(pair, tmp_path):
+    main(Config(dataset=str(pair[0]), output=tmp_path / "tracked", track=True))
+    position, state = read(tmp_path / "tracked", "dynamics.position"), read(pair[0], "observation.state")
+    assert open_with_lerobot(tmp_path / "tracked").meta.features["dynamics.position"]["names"] == ["x", "y"]
+    error = np.abs(position - (state[:, :2] * [128, 96] - 0.5))
+    assert np.median(error) < 1.5 and error.mean() < 4, "pixels; the place that is background is not found"
+
+
+def test_one_entry_is_a_column_of_numbers(images, tmp_path):
+    main(Config(dataset=str(images[0]), output=tmp_path / "one", columns="1", method="savgol", window=5))
+    assert open_with_lerobot(tmp_path / "one")[40]["dynamics.velocity"].numel() == 1
+
+
+def test_a_killed_run_leaves_nothing_that_looks_done(images, tmp_path):
+    output = tmp_path / "output"
+    arguments = "--dataset", str(images[0]), "--output", str(output)
+    kill = "import os; from dynmap_rl.data import columns; columns._write_stats = lambda *a: os._exit(9);"
+    code = f"{kill} import runpy, sys; sys.argv[1:] = {list(arguments)}; runpy.run_path({str(RECIPE)!r}, run_name='__main__')"
+    killed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=os.environ)
+    assert killed.returncode == 9, killed.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["output.tmp"]
+    main(Config(dataset=str(images[0]), output=output))
+    assert [path.name for path in tmp_path.iterdir()] == ["output"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"state": "observation.nothing"}, "no column 'observation.nothing' of numbers; choose --state from"),
+        ({"columns": "0,4"}, "are different ones of 0 to 3"),
+        ({"columns": "a"}, "--columns are whole numbers such as 0,1,2, not 'a'"),
+        ({"columns": "0,1", "angles": "2"}, r"--angles \[2\] are not among --columns \[0, 1\]"),
+        ({"method": "spline"}, "--method is one of central, savgol"),
+        ({"method": "savgol", "window": 4}, "odd --window"),
+        ({"method": "savgol", "window": 25}, "episode 2 has 24 steps"),
+        (
+            {"track": True, "camera": "front"},
+            "no camera 'front'; choose --camera from observation.images.top",
+        ),
+        ({"dataset": "no/where/here"}, "no dataset at no/where/here"),
+        ({"dataset": None}, "name the dataset"),
+    ],
+)
+def test_bad_input_is_refused_before_anything_is_written(images, tmp_path, settings, message):
+    with pytest.raises(ValueError, match=message):
+        main(Config(**({"dataset": str(images[0]), "output": tmp_path / "bad"} | settings)))
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_folder_that_exists_and_columns_that_are_there_are_one_line(images, tmp_path):
+    result = run(tmp_path, "--dataset", str(images[0]), "--output", str(images[1]))
+    assert (result.returncode, result.stderr.count("\n")) == (2, 1)
+    assert result.stderr.startswith(f"error: {images[1]} exists")
+    with pytest.raises(ValueError, match=r"has dynamics.position, .* already; --replace"):
+        main(Config(dataset=str(images[1]), output=tmp_path / "again"))
