@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
+from dynmap_rl.modules import DYNAMICS
+
 from .columns import spans, write_columns
 from .frames import choose_camera, iterate_frames
 from .loading import _read_column, _read_info, _read_table, find_dataset
 from .tracking import WIDEST, track_centroid
 
-DYNAMICS = ("position", "velocity", "acceleration")
 METHODS = ("central", "savgol")
 
 

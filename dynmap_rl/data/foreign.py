@@ -12,8 +12,10 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
+from dynmap_rl.modules import DYNAMICS
+
 from .columns import spans
-from .dynamics import DYNAMICS, entry_names, parse_entries
+from .dynamics import entry_names, parse_entries
 from .frames import choose_camera, iterate_frames
 from .loading import FRAME_SHAPE, _read_column, _read_info, _read_table, find_dataset
 

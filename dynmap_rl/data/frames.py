@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import pairwise
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+
+from .columns import spans
 
 TOLERANCE = 1e-4  # s, LeRobot's own, between a timestamp and the video's frame
 BLOCK = 100  # frames decoded at a time: full-sized ones of a whole episode may not fit into memory
@@ -51,10 +52,8 @@ def iterate_frames(
     columns = ["episode_index", "timestamp", *([] if episodes else [camera])]
     for file in sorted((root / "data").glob("*/*.parquet")):
         table = _read(file, columns)
-        index = table["episode_index"].to_numpy()
-        borders = [0, *(np.flatnonzero(np.diff(index)) + 1), len(index)]
-        for start, end in pairwise(borders):
-            rows = table.slice(start, end - start)
+        for episode, span in spans(table["episode_index"].to_numpy()):
+            rows = table.slice(span.start, span.stop - span.start)
             blocks = (
                 _decode_video(root, info, episodes, camera, rows) if episodes else _decode(file, camera, rows)
             )
@@ -62,7 +61,7 @@ def iterate_frames(
             for block in blocks:
                 width = block[0].shape[1]
                 frames += [_resize(frame, size or _reduced(frame, widest)) for frame in block]
-            yield int(index[start]), np.stack(frames), width / frames[0].shape[1]
+            yield episode, np.stack(frames), width / frames[0].shape[1]
 
 
 def _read(file: Path, columns: list[str]) -> pa.Table:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-DYNAMICS = ("position", "velocity", "acceleration")
+from dynmap_rl.modules import DYNAMICS
+
 METRICS = {  # those that the paper reports for a task
     "balance_reaching": ("DR", "PE", "SR"),
     "balance_reaching_obstacle": ("DR", "SR"),

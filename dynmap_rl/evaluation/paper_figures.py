@@ -14,11 +14,11 @@ from tensordict import TensorDictBase
 
 from dynmap_rl.envs.tasks import SUCCESS_DISTANCE
 from dynmap_rl.envs.world import CONTROL_DT
-from dynmap_rl.modules import Normalizer
+from dynmap_rl.modules import DYNAMICS, Normalizer
 from dynmap_rl.runs import read_metrics
 
 from .figures import COMPONENTS, UNITS, moving_steps, plt, save_figure
-from .paper import DYNAMICS, row_name
+from .paper import row_name
 
 FRAMES = 8  # of a film strip
 
