@@ -37,7 +37,7 @@ def peak(command: list[str], folder: str) -> float:
     most = 0
     while process.poll() is None:
         most = max(most, sum(map(held, family(process.pid))))
-        time.sleep(0.1)
+        time.sleep(0.5)
     if process.returncode:
         raise OSError(f"{' '.join(command)} failed")
     return most / 1e6

@@ -19,6 +19,7 @@ import learning
 import loading
 import ppo
 import simulation
+import starting
 
 from dynmap_rl.runs import read_json, write_json
 
@@ -56,6 +57,8 @@ ROWS = {
         "evaluation, an episode of 1,000", "one at a time through the Gymnasium id", "ms", MS, "<= 0.2",
         lambda: learning.evaluation(DATASET),
     ),
+    "import": ("`import dynmap_rl`", "`import gymnasium`", "s", 1, "ours < 0.3 s", starting.import_package),
+    "help": ("`--help` of the slowest recipe", "`import torch`", "s", 1, "ours < 1 s", starting.show_help),
 }  # fmt: skip
 
 
