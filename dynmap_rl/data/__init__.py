@@ -17,7 +17,7 @@ _MODULES = {
     "load_meta": "loading",
     "normalization_constants": "recording",
     "parse_entries": "dynamics",
-    "push_dataset": "writing",
+    "push_dataset": "hub",
     "range_constants": "foreign",
     "record_dataset": "recording",
     "sample_windows": "augmentation",

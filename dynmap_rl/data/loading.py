@@ -94,6 +94,7 @@ def find_dataset(dataset: str | Path) -> Path:
     may_be_id = isinstance(dataset, str) and len(folder.parts) == 2 and dataset[0] not in "./~"
     if not may_be_id or folder.parts[0] == "datasets":  # where recipes/collect.py writes to
         raise ValueError(f"no dataset at {dataset}; record one with recipes/collect.py --output {dataset}")
+    from httpx import HTTPError
     from huggingface_hub import snapshot_download
     from lerobot.utils.constants import HF_LEROBOT_HUB_CACHE
 
@@ -103,7 +104,7 @@ def find_dataset(dataset: str | Path) -> Path:
                 dataset, repo_type="dataset", revision=LEROBOT_VERSION, cache_dir=HF_LEROBOT_HUB_CACHE
             )
         )
-    except (OSError, ValueError) as error:  # every error of the hub is one of these
+    except (OSError, ValueError, HTTPError) as error:  # every error of the hub's client, or of the network below it
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise ValueError(
             f"no dataset at {dataset}, neither as a folder nor with the tag {LEROBOT_VERSION} on the hub ({reason}); "

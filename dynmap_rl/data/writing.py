@@ -1,4 +1,4 @@
-"""Rollouts as LeRobot v3.0 files: the columns, the writing, the merging, and the way to the hub."""
+"""Rollouts as LeRobot v3.0 files: the columns, the writing, the merging."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tensordict import TensorDict
 
 from dynmap_rl.envs.world import CONTROL_DT, EPISODE_STEPS
 
-from .loading import CAMERA, META, NEEDED, OPTIONAL, load_dataset, load_meta
+from .loading import CAMERA, NEEDED, OPTIONAL, load_dataset
 
 LOCAL_ID = "dynmap_rl/recording"  # LeRobot wants an id; it is stored nowhere
 FPS = round(1 / CONTROL_DT)
@@ -31,22 +31,6 @@ FEATURES = {
     "dynamics.velocity": {"dtype": "float32", "shape": (6,), "names": BODIES},
     "dynamics.acceleration": {"dtype": "float32", "shape": (6,), "names": BODIES},
 }
-DESCRIPTION = """\
-{kind} of the task `{task}` of dynmap_rl, for world models that are supervised on the dynamics of the scene:
-"{instruction}" A cart carries a free-standing block over a scene of 1 m x 1 m: {episodes} episodes of {steps} steps
-at {fps} Hz, simulated with PyMunk, drawn with pygame, made by state-based PPO experts: {selection}.
-
-| column | shape | content |
-|---|---|---|
-| `observation.images.front` | 64, 64, 3 | the frame, lossless |
-| `observation.state` | 5 | commanded cart pose x, y, theta (m, m, rad) and goal x, y (m) |
-| `action` | 3 | change of the commanded cart pose in one step (m, m, rad) |
-| `next.reward`, `next.done`, `next.success` | 1 | after the action |
-| `dynamics.position` | 6 | cart x, y, theta, block x, y, theta (m, m, rad) |
-| `dynamics.velocity` | 6 | its rate, as the simulator has it (m/s, rad/s) |
-| `dynamics.acceleration` | 6 | change of velocity since the last step over {dt} s (m/s^2, rad/s^2); 0 at the start |
-
-`{meta}` holds the splits ({splits}), constants for normalisation, and scene, seed and expert of every episode."""
 
 
 def write_episodes(folder: Path, episodes: TensorDict, instruction: str) -> None:
@@ -108,44 +92,6 @@ def merge_datasets(folders: list[Path], into: Path, splits: dict[str, list[int]]
         stats = dataset.meta.stats | _compute_stats(episodes)
         write_stats({name: stats[name] for name in sorted(stats)}, into)
     return episodes
-
-
-def push_dataset(root: str | Path, repo_id: str) -> None:
-    """Upload a recording to the Hugging Face hub, with a card and the tag by which LeRobot finds it.
-
-    Raises:
-        ValueError: the folder is no recording of ours.
-        OSError: the hub refuses it or cannot be reached.
-    """
-    meta = load_meta(root)
-    with quiet():
-        from lerobot.datasets import LeRobotDataset
-
-        try:
-            dataset = LeRobotDataset(repo_id, root=root, video_backend="pyav")
-            description = _describe(meta, instruction=dataset.meta.tasks.index[0])
-            dataset.push_to_hub(tags=["dynamics"], license="mit", dataset_description=description)
-        except Exception as error:  # of the hub's client, or of the HTTP library below it
-            reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-            raise OSError(
-                f"cannot push {root} to {repo_id} ({reason}); check the name, the network, and `hf auth login`"
-            ) from error
-
-
-def _describe(meta: dict, instruction: str) -> str:
-    exploring = meta["kind"] == "exploration"
-    return DESCRIPTION.format(
-        kind=meta["kind"].capitalize(),
-        task=meta["task"],
-        instruction=instruction,
-        episodes=len(meta["episodes"]),
-        steps=EPISODE_STEPS,
-        fps=FPS,
-        selection="with noise and detours" if exploring else "successful episodes, most with pushes",
-        dt=CONTROL_DT,
-        meta=META,
-        splits=", ".join(f"{name} {first} to {end - 1}" for name, (first, end) in meta["splits"].items()),
-    )
 
 
 def _to_columns(episodes: TensorDict) -> dict[str, np.ndarray]:

@@ -1,6 +1,7 @@
 """A stand-in for the Hugging Face hub on the loopback interface: as much of it as pushing and pulling a dataset takes.
 
-``python stand_in_hub.py`` serves until it is ended and prints its address. Repositories live in memory.
+``python stand_in_hub.py`` serves until it is ended and prints its address. Repositories live in memory. ``POST /cut`` makes
+it break off every file of more than 10 kB in the middle, ``POST /mend`` ends that.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from urllib.parse import unquote
 
 REPOS: dict[str, Repo] = {}
 BLOBS: dict[str, bytes] = {}  # large files by their SHA-256
+CUTTING: list[bool] = []
 
 
 class Repo:
@@ -47,7 +49,9 @@ class Handler(BaseHTTPRequestHandler):
             self.send_header(name, content)
         self.end_headers()
         if self.command != "HEAD":
-            self.wfile.write(body)
+            cut = CUTTING and len(body) > 10_000
+            self.wfile.write(body[: len(body) // 2] if cut else body)
+            self.close_connection |= bool(cut)
 
     def refuse(self, code: str):
         self.answer({"error": code}, 404, {"X-Error-Code": code})
@@ -65,6 +69,9 @@ class Handler(BaseHTTPRequestHandler):
     def handle_request(self):
         path, data = unquote(self.path).split("?")[0], self.body()
         address = f"http://{self.headers['Host']}"
+        if path in ("/cut", "/mend"):
+            CUTTING[:] = [True] if path == "/cut" else []
+            return self.answer()
         if path == "/api/repos/create":
             wanted = json.loads(data)
             name = f"{wanted.get('organization') or 'someone'}/{wanted['name']}"

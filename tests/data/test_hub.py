@@ -1,4 +1,4 @@
-"""Push, pull, push again and use offline, against a stand-in hub.
+"""Push, pull, push again and use offline, against a stand-in hub; and what is said when there is none.
 
 In processes of their own: the hub's client takes its address from the environment when it is imported.
 """
@@ -10,28 +10,36 @@ import sys
 import urllib.request
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
+
+from dynmap_rl.data import load_dataset
+from dynmap_rl.data.hub import draw_episodes
 
 ONLINE = """
+import urllib.request
 from unittest import mock
 
-from huggingface_hub import RepoCard
+import pytest
+from huggingface_hub import RepoCard, constants
 
 from dynmap_rl.data import load_dataset, load_meta, push_dataset
 from dynmap_rl.runs import write_json
 
 name = "someone/demonstrations"
-try:
+with pytest.raises(ValueError, match=f"no dataset at {{name}}, neither as a folder nor .*; check the name"):
     load_dataset(name)
-except ValueError as error:
-    assert f"no dataset at {{name}}, neither as a folder nor" in str(error), error
-else:
-    raise AssertionError("loaded what nobody pushed")
 for note in ("first", "second"):
     meta = load_meta({root!r}) | {{"note": note}}
     write_json({root!r} + "/meta/dynmap.json", meta)
     with mock.patch.object(RepoCard, "validate"):  # asks an address that cannot be changed
         push_dataset({root!r}, name)
+    if note == "first":
+        urllib.request.urlopen(constants.ENDPOINT + "/cut", b"")
+        with pytest.raises(ValueError, match="no dataset at .*; check the name and the network"):
+            load_dataset(name)
+        urllib.request.urlopen(constants.ENDPOINT + "/mend", b"")
     assert (load_dataset(name) == load_dataset({root!r})).all()
     assert load_meta(name) == meta
 
@@ -45,6 +53,16 @@ from dynmap_rl.data import load_dataset, load_meta
 assert (load_dataset("someone/demonstrations") == load_dataset({root!r})).all()
 assert load_meta("someone/demonstrations")["note"] == "second"
 """
+NO_NETWORK = """
+import pytest
+
+from dynmap_rl.data import load_dataset, push_dataset
+
+with pytest.raises(ValueError, match="no dataset at someone/else, .*; check the name and the network"):
+    load_dataset("someone/else")
+with pytest.raises(OSError, match="cannot push .* to someone/else .*; check the name, the network"):
+    push_dataset({root!r}, "someone/else")
+"""
 
 
 @pytest.fixture
@@ -56,35 +74,45 @@ def hub():
     process.wait()
 
 
-@pytest.mark.slow
-def test_push_pull_push_again_and_use_offline(recording, tmp_path, hub):
-    root = str(shutil.copytree(recording, tmp_path / "dataset"))
-    home = tmp_path / "home"
+def run(code, endpoint, home, offline="0"):
     environment = {
-        "HF_ENDPOINT": hub,
+        "HF_ENDPOINT": endpoint,
         "HF_TOKEN": "hf_dummy",
         "HF_HUB_DISABLE_XET": "1",
+        "HF_HUB_OFFLINE": offline,
         "HF_HOME": str(home),
+        "HF_LEROBOT_HOME": str(home / "lerobot"),
     }
-    for code, offline in ((ONLINE, "0"), (OFFLINE, "1")):
-        result = subprocess.run(
-            [sys.executable, "-c", code.format(root=root)],
-            env={
-                **os.environ,
-                **environment,
-                "HF_HUB_OFFLINE": offline,
-                "HF_LEROBOT_HOME": str(home / "lerobot"),
-            },
-            capture_output=True,
-            text=True,
-        )
-        assert result.returncode == 0, result.stderr
+    command = [sys.executable, "-c", code]
+    result = subprocess.run(command, env={**os.environ, **environment}, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
 
-    card = (
-        urllib.request.urlopen(f"{hub}/datasets/someone/demonstrations/resolve/v3.0/README.md")
-        .read()
-        .decode()
-    )
+
+@pytest.mark.slow
+def test_push_a_pull_that_is_cut_off_pull_push_again_and_use_offline(recording, tmp_path, hub):
+    root = str(shutil.copytree(recording, tmp_path / "dataset"))
+    run(ONLINE.format(root=root), hub, tmp_path / "home")
+    run(OFFLINE.format(root=root), hub, tmp_path / "home", offline="1")
+
+    address = f"{hub}/datasets/someone/demonstrations/resolve/v3.0"
+    card = urllib.request.urlopen(f"{address}/README.md").read().decode()
     assert "license: mit" in card
     assert "| `dynamics.velocity` | 6 |" in card
     assert "train 0 to 3, eval 4 to 5" in card
+    assert "--episodes 4 --eval_episodes 2" in card
+    assert "More Information Needed" not in card
+    picture = Image.open(urllib.request.urlopen(f"{address}/picture.png"))
+    assert "](picture.png)" in card and picture.size == (8 * 128, 3 * 128)
+
+
+@pytest.mark.slow
+def test_without_a_network_there_is_one_clear_error(recording, tmp_path):
+    root = str(shutil.copytree(recording, tmp_path / "dataset"))
+    run(NO_NETWORK.format(root=root), "http://127.0.0.1:9", tmp_path / "home")  # nobody listens
+
+
+def test_the_picture_shows_frames(recording, tmp_path):
+    episodes = load_dataset(recording, "train")
+    draw_episodes(episodes, tmp_path / "picture.png", rows=2, columns=3, zoom=1)
+    picture = np.asarray(Image.open(tmp_path / "picture.png"))
+    assert (picture[64:, 128:] == episodes["pixels"][1, -1].permute(1, 2, 0).numpy()).all()

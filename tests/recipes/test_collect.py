@@ -39,7 +39,7 @@ def test_records_where_it_says_and_then_says_that_it_is_complete(
 
 def test_pushes_what_is_there_already(recording, monkeypatch, capsys):
     pushed = []
-    monkeypatch.setattr("dynmap_rl.data.writing.push_dataset", lambda *arguments: pushed.append(arguments))
+    monkeypatch.setattr("dynmap_rl.data.hub.push_dataset", lambda *arguments: pushed.append(arguments))
     main(Config(output=recording, episodes=4, eval_episodes=2, push_to_hub="someone/demonstrations"))
     assert pushed == [(recording, "someone/demonstrations")]
     assert "pushed: someone/demonstrations" in capsys.readouterr().out
