@@ -14,7 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from dynmap_rl import data, modules, runs
 from dynmap_rl.evaluation import evaluate, policy_errors
-from dynmap_rl.modules import WorldModel
+from dynmap_rl.modules import Actor, WorldModel
 from dynmap_rl.training import fingerprint, train_policy
 
 
@@ -98,7 +98,7 @@ def _train_and_evaluate(arguments: tuple) -> None:
         result = {"held_out": policy_errors(policy, held_out)}
     else:
         episodes = settings.test_episodes, settings.paper_episodes
-        result = evaluate(world_model, policy, settings.task, *episodes, settings.split)
+        result = evaluate(Actor(world_model, policy, mixed=True), settings.task, *episodes, settings.split)
     result["world_model_sha256"] = fingerprint(world_model)
     if result["world_model_sha256"] != frozen:
         raise ValueError("the frozen world model has changed; this run is not valid")

@@ -58,5 +58,7 @@ def _train_and_evaluate(arguments: tuple) -> None:
         result = {"held_out": errors | policy_errors(policy, features)}
     else:
         sizes = settings.test_episodes, settings.paper_episodes
-        result = evaluate(world_model, policy, settings.task, *sizes, settings.split)
+        result = evaluate(
+            modules.Actor(world_model, policy, mixed=True), settings.task, *sizes, settings.split
+        )
     runs.write_json(folder / "eval.json", result | {"world_model_sha256": fingerprint(world_model)})

@@ -1,10 +1,12 @@
-"""Judge an expert on a task's test scenes; the expert may be that of another task.
+"""Judge a trained policy, or an expert, on a task's test scenes.
 
-    python recipes/evaluate.py --task bin_dropping
-    python recipes/evaluate.py --task balance_reaching_obstacle --expert balance_reaching
+    python recipes/evaluate.py --policy runs/decoupled/balance_reaching/position_velocity_recurrent
+    python recipes/evaluate.py --policy runs/act/checkpoints/last/pretrained_model   # any policy of LeRobot
+    python recipes/evaluate.py --expert balance_reaching --task balance_reaching_obstacle
 
-Prints success, drop and touch rates with 95 % Wilson intervals, for task 2 also how often the straight path to the
-goal is blocked and how often the shortest way leads around the obstacle, and writes them as JSON.
+A policy sees frames and acts in closed loop: drop rate, position error and success rate, as in our tables. An expert,
+by default the task's own, sees the state: success, drop and touch rates, for task 2 also how often the straight path
+to the goal is blocked and how often the shortest way leads around the obstacle. Rates have 95 % Wilson intervals.
 """
 
 from dataclasses import dataclass
@@ -15,8 +17,13 @@ from dynmap_rl.runs import run_recipe
 
 @dataclass
 class Config:
-    # Name of the task: balance_reaching, balance_reaching_obstacle, bin_dropping, or module:Class of your own.
-    task: str = "balance_reaching"
+    # Run folder of ours, or a pretrained_model folder of LeRobot, or its id on the Hugging Face hub.
+    policy: str | None = None
+    # Which of a run's policies.
+    seed: int = 0
+    # Name of the task: balance_reaching, balance_reaching_obstacle, bin_dropping, or module:Class of your own; by
+    # default the one that a run of ours was trained on, otherwise balance_reaching.
+    task: str | None = None
     # Expert: the name of the task that it ships for, or a folder of checkpoints; by default the task's own.
     expert: str | None = None
     # Its checkpoint; by default the last.
@@ -24,27 +31,71 @@ class Config:
     # Scenes, and the split they are of.
     episodes: int = 1000
     split: str = "test"
-    # JSON file; by default runs/evaluate/TASK_EXPERT_CHECKPOINT_SPLIT.json.
+    # JSON file; by default one in runs/evaluate.
     output: Path | None = None
 
 
 def main(config: Config) -> None:
+    from dynmap_rl.runs import command_line, write_json
+
+    if config.episodes < 1:
+        raise ValueError(f"--episodes must be at least 1, not {config.episodes}")
+    if config.policy and (config.expert or config.checkpoint):
+        raise ValueError("--policy and --expert: name one of them")
+    name, result = (judge_policy if config.policy else judge_expert)(config)
+    output = config.output or Path("runs/evaluate") / f"{name}_{config.split}.json"
+    common = {"split": config.split, "episodes": config.episodes, "command": command_line()}
+    write_json(output, result | common)
+    print(f"written: {output}")
+
+
+def judge_policy(config: Config) -> tuple[str, dict]:
+    """The name of the result, and the result: ``DR``, ``PE``, ``SR`` and what became of every episode."""
+    from dynmap_rl.evaluation import evaluate
+    from dynmap_rl.modules import load_actor
+    from dynmap_rl.runs import read_json
+
+    folder, settings = Path(config.policy), {}
+    if (folder / f"seed_{config.seed}").exists():
+        actor, settings = load_actor(folder, config.seed), read_json(folder / "config.json")
+    else:
+        actor = load_lerobot(config)
+    task = config.task or settings.get("task", "balance_reaching")
+    result = evaluate(actor, task, config.episodes, 0, config.split)["test"]
+    summary = result["summary"]
+    low, high = summary["SR_interval"]
+    print(
+        f"DR {summary['DR']:.1f} %   PE {summary['PE']:.1f} mm   SR {summary['SR']:.1f} % [{low:.1f}, {high:.1f}]"
+    )
+    return f"{task}_{folder.name}_seed_{config.seed}", {"task": task, "policy": config.policy, **result}
+
+
+def load_lerobot(config: Config):
+    try:
+        from dynmap_rl.integrations.lerobot import LeRobotActor
+    except ImportError as error:
+        raise ValueError(
+            f"{config.policy} is no run of ours with a seed {config.seed}; for a policy of LeRobot install "
+            f"'dynmap_rl[lerobot]' ({error})"
+        ) from error
+    return LeRobotActor(config.policy)
+
+
+def judge_expert(config: Config) -> tuple[str, dict]:
+    """The name of the result, and the result: ``rates`` and ``intervals`` (%)."""
     from dynmap_rl.envs.geometry import path_is_blocked, way_from_start
     from dynmap_rl.envs.scene import ObstacleScene
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.evaluation import scene_seeds, wilson
     from dynmap_rl.experts import find_expert, list_checkpoints, load_expert, roll_out
-    from dynmap_rl.runs import command_line, read_json, write_json
+    from dynmap_rl.runs import read_json
 
-    task = get_task(config.task)
-    if config.episodes < 1:
-        raise ValueError(f"--episodes must be at least 1, not {config.episodes}")
+    task = get_task(config.task or "balance_reaching")
     expert = config.expert or task.name
     checkpoint = config.checkpoint or list_checkpoints(expert)[-1]
     network = load_expert(expert, checkpoint)
     trained_on = get_task(read_json(find_expert(expert) / f"{checkpoint}.json")["task"])
-    seeds = scene_seeds(config.split, config.episodes)
-    worlds = roll_out(network, task, seeds, states=trained_on)
+    worlds = roll_out(network, task, scene_seeds(config.split, config.episodes), states=trained_on)
     outcomes = {
         "success": [task.is_success(world) for world in worlds],
         "dropped": [world.dropped for world in worlds],
@@ -58,22 +109,8 @@ def main(config: Config) -> None:
     for name, rate in rates.items():
         low, high = intervals[name]
         print(f"{name.replace('_', ' '):22} {rate:5.1f} % [{low:.1f}, {high:.1f}]")
-    name = f"{task.name}_{trained_on.name}_{checkpoint}_{config.split}.json"
-    output = config.output or Path("runs/evaluate") / name
-    write_json(
-        output,
-        {
-            "task": config.task,
-            "expert": expert,
-            "checkpoint": checkpoint,
-            "split": config.split,
-            "episodes": len(worlds),
-            "rates": rates,
-            "intervals": intervals,
-            "command": command_line(),
-        },
-    )
-    print(f"written: {output}")
+    result = {"task": config.task or task.name, "expert": expert, "checkpoint": checkpoint}
+    return f"{task.name}_{trained_on.name}_{checkpoint}", result | {"rates": rates, "intervals": intervals}
 
 
 if __name__ == "__main__":

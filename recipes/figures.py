@@ -166,16 +166,12 @@ def draw_fig8(config: Config, datasets: dict) -> None:
     """The paper's 50 test episodes of the first policy seed."""
     from dynmap_rl.evaluation import SHARED_STARTS, roll_out, scene_seeds
     from dynmap_rl.evaluation.paper_figures import plot_position_errors
-    from dynmap_rl.modules import Actor, load_policy, load_world_model
-    from dynmap_rl.runs import read_json
+    from dynmap_rl.modules import load_actor
 
     missing, panels = find_missing(config, list(POLICIES.values())), dict.fromkeys(POLICIES)
     for title, cell in POLICIES.items():
         if cell not in missing:
-            run = config.runs / cell
-            seed = read_json(run / "eval.json")["seeds"][0]
-            policy = load_policy(run / f"seed_{seed}" / "policy")
-            actor = Actor(load_world_model(run / "world_model"), policy, mixed=True)
+            actor = load_actor(config.runs / cell)
             panels[title] = roll_out(actor, ONE, scene_seeds("test", 50, start=SHARED_STARTS))
     plot_position_errors(panels, config.output / "fig8.png")
 

@@ -104,7 +104,11 @@ def find_dataset(dataset: str | Path) -> Path:
                 dataset, repo_type="dataset", revision=LEROBOT_VERSION, cache_dir=HF_LEROBOT_HUB_CACHE
             )
         )
-    except (OSError, ValueError, HTTPError) as error:  # every error of the hub's client, or of the network below it
+    except (
+        OSError,
+        ValueError,
+        HTTPError,
+    ) as error:  # every error of the hub's client, or of the network below it
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise ValueError(
             f"no dataset at {dataset}, neither as a folder nor with the tag {LEROBOT_VERSION} on the hub ({reason}); "

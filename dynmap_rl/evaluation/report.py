@@ -23,15 +23,14 @@ SHARED_STARTS = 1000  # the paper's protocol uses the scenes after these
 
 
 def evaluate(
-    world_model: WorldModel,
-    policy,
+    actor: Actor,
     task: str,
     test_episodes: int = 1000,
     paper_episodes: int = 50,
     split: str = "test",
 ) -> dict[str, dict]:
-    """One policy by both protocols: rows and summary on ``test_episodes`` shared start states (``test``) and on
-    ``paper_episodes`` others (``paper``) of a split of the scenes. All episodes run as one batch.
+    """One actor (see :func:`roll_out`) by both protocols: rows and summary on ``test_episodes`` shared start states
+    (``test``) and on ``paper_episodes`` others (``paper``, where there are any) of a split of the scenes. All episodes run as one batch.
 
     Raises:
         ValueError: more than 1,000 shared start states, which are all there are.
@@ -40,9 +39,11 @@ def evaluate(
         raise ValueError(f"there are {SHARED_STARTS} shared start states, not {test_episodes}")
     seeds = scene_seeds(split, test_episodes)
     seeds += scene_seeds(split, paper_episodes, start=SHARED_STARTS)
-    rows = episode_rows(roll_out(Actor(world_model, policy, mixed=True), task, seeds), seeds)
+    rows = episode_rows(roll_out(actor, task, seeds), seeds)
     parts = {"test": rows[:test_episodes], "paper": rows[test_episodes:]}
-    return {name: {"summary": summarize(part), "rows": _columns(part)} for name, part in parts.items()}
+    return {
+        name: {"summary": summarize(part), "rows": _columns(part)} for name, part in parts.items() if part
+    }
 
 
 def write_report(

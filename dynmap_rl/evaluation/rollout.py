@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import step_mdp
 from tqdm import tqdm
 
 from dynmap_rl.envs import DynmapBatchedEnv, scene_seed
 from dynmap_rl.envs.world import EPISODE_STEPS
-from dynmap_rl.modules import Actor
 
 
 def scene_seeds(split: str, count: int, start: int = 0) -> list[int]:
@@ -18,8 +18,17 @@ def scene_seeds(split: str, count: int, start: int = 0) -> list[int]:
 
 
 @torch.no_grad()
-def roll_out(actor: Actor, task: str, seeds: list[int], keep_pixels: bool = False) -> TensorDict:
+def roll_out(
+    actor: TensorDictModuleBase, task: str, seeds: list[int], keep_pixels: bool = False
+) -> TensorDict:
     """Run one episode of 120 steps for each scene seed, to the end also where the block is dropped.
+
+    Args:
+        actor: reads ``pixels``, ``goal`` or ``agent_pos`` and writes ``action``, as a :class:`dynmap_rl.modules.Actor`
+            does.
+        task: its name.
+        seeds: of the scenes.
+        keep_pixels: whether frames are in the result.
 
     Returns:
         A TensorDict ``[E, 120]`` with the environment's entries at t (``dynamics``, ``action``, ``goal``, ...;
@@ -39,15 +48,18 @@ def roll_out(actor: Actor, task: str, seeds: list[int], keep_pixels: bool = Fals
     ]
     keys += ["pixels"] if keep_pixels else []
     steps = []
-    predicted = {q: torch.zeros(len(seeds), 6, device=device) for q in actor.world_model.supervision}
+    world_model = getattr(actor, "world_model", None)
+    quantities = world_model.supervision if world_model else ()
+    predicted = {quantity: torch.zeros(len(seeds), 6, device=device) for quantity in quantities}
     for _ in tqdm(range(EPISODE_STEPS), f"{len(seeds)} episodes", unit="step", leave=False):
         td = env.step(actor(td))
         step = td.select(*keys)
         step["predicted_dynamics"] = TensorDict(predicted, [len(seeds)])
         steps.append(step)
         td = step_mdp(td, keep_other=False)
-        states = td["predicted_latent"], td["hidden1"], td["hidden2"]
-        predicted = actor.world_model.decode_dynamics(*states)
+        if quantities:
+            states = td["predicted_latent"], td["hidden1"], td["hidden2"]
+            predicted = world_model.decode_dynamics(*states)
     return torch.stack(steps, 1).cpu()
 
 

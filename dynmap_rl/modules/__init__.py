@@ -2,6 +2,7 @@
 
 from .checkpoints import (
     check_policy,
+    load_actor,
     load_policy,
     load_world_model,
     make_policy,
@@ -36,6 +37,7 @@ __all__ = [
     "WorldModel",
     "check_policy",
     "delay",
+    "load_actor",
     "load_policy",
     "load_world_model",
     "make_policy",

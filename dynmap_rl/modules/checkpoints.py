@@ -10,6 +10,7 @@ from dynmap_rl.runs import load_weights, read_json, save_weights, write_json
 
 from .normalization import Normalizer
 from .policy import FeedforwardPolicy, RecurrentPolicy
+from .tensordict_modules import Actor
 from .world_model import WorldModel
 
 POLICIES = {"feedforward": FeedforwardPolicy, "recurrent": RecurrentPolicy}
@@ -87,6 +88,19 @@ def load_policy(folder: Path) -> FeedforwardPolicy | RecurrentPolicy:
     policy = kind(**arguments)
     load_weights(Path(folder) / "weights.safetensors", policy)
     return policy.eval()
+
+
+def load_actor(run: Path, seed: int = 0) -> Actor:
+    """World model and policy of a run folder (of ``recipes/decoupled.py``, ``joint.py``, ``end_to_end.py`` or
+    ``generalize.py``) as they act in its evaluation.
+
+    Raises:
+        ValueError: the folder holds no policy of that seed.
+    """
+    run = Path(run)
+    own = run / f"seed_{seed}" / "world_model"  # joint training has one for each seed
+    world_model = load_world_model(own if own.exists() else run / "world_model")
+    return Actor(world_model, load_policy(run / f"seed_{seed}" / "policy"), mixed=True)
 
 
 def _read_arguments(folder: Path) -> dict:

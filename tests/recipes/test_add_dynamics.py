@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
+from commands import run
 from foreign_dataset import CAMERA, FPS, make_foreign
 
 from dynmap_rl.data import load_dataset
@@ -19,11 +20,6 @@ from recipes.add_dynamics import Config, main
 RECIPE = Path(__file__).parents[2] / "recipes" / "add_dynamics.py"
 QUANTITIES = ("position", "velocity", "acceleration")
 LENGTHS = (31, 47, 24, 33)
-
-
-def run(folder, *arguments):
-    command = [sys.executable, str(RECIPE), *arguments]
-    return subprocess.run(command, cwd=folder, env=os.environ, capture_output=True, text=True)
 
 
 def make_pair(folder, videos):
@@ -206,7 +202,7 @@ def test_bad_input_is_refused_before_anything_is_written(images, tmp_path, setti
 
 
 def test_a_folder_that_exists_and_columns_that_are_there_are_one_line(images, tmp_path):
-    result = run(tmp_path, "--dataset", str(images[0]), "--output", str(images[1]))
+    result = run(tmp_path, "add_dynamics", "--dataset", str(images[0]), "--output", str(images[1]))
     assert (result.returncode, result.stderr.count("\n")) == (2, 1)
     assert result.stderr.startswith(f"error: {images[1]} exists")
     with pytest.raises(ValueError, match=r"has dynamics.position, .* already; --replace"):

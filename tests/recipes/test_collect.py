@@ -6,17 +6,13 @@ import sys
 from pathlib import Path
 
 import pytest
+from commands import run
 
 from dynmap_rl.data import load_dataset
 from dynmap_rl.envs.tasks import TASKS
 from recipes.collect import Config, main
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "collect.py"
-
-
-def run(folder, *arguments):
-    command = [sys.executable, str(RECIPE), *arguments]
-    return subprocess.run(command, cwd=folder, env=os.environ, capture_output=True, text=True)
 
 
 @pytest.mark.parametrize(
@@ -46,7 +42,7 @@ def test_pushes_what_is_there_already(recording, monkeypatch, capsys):
 
 
 def test_a_mistake_is_one_line(recording, tmp_path):
-    result = run(tmp_path, "--output", str(recording))
+    result = run(tmp_path, "collect", "--output", str(recording))
     assert result.returncode == 2
     assert result.stderr.startswith(
         f"error: {recording} holds another recording (episodes: 4 there, 300 here"

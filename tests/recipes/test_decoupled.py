@@ -1,4 +1,3 @@
-import importlib.util
 import json
 import os
 import subprocess
@@ -6,33 +5,22 @@ import sys
 from pathlib import Path
 
 import pytest
+from commands import run
 
 from dynmap_rl.envs.tasks import TASKS
+from recipes.decoupled import Config, main
 
-ROOT = Path(__file__).parents[2]
-
-
-def run(folder, *arguments):
-    command = [sys.executable, str(ROOT / "recipes" / "decoupled.py"), *arguments]
-    return subprocess.run(command, cwd=folder, env=os.environ, capture_output=True, text=True)
+RECIPE = Path(__file__).parents[2] / "recipes" / "decoupled.py"
 
 
 @pytest.fixture(scope="module")
 def smoke(tmp_path_factory):
-    """One smoke run with no other option: it records, trains, evaluates and draws."""
+    """One smoke run as a process with no other option: it records, trains, evaluates and draws."""
     folder = tmp_path_factory.mktemp("smoke")
-    result = run(folder, "--smoke")
+    command = [sys.executable, str(RECIPE), "--smoke"]
+    result = subprocess.run(command, cwd=folder, env=os.environ, capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
     return folder, result
-
-
-@pytest.fixture(scope="module")
-def recipe():
-    spec = importlib.util.spec_from_file_location("decoupled_recipe", ROOT / "recipes" / "decoupled.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["decoupled_recipe"] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 def test_smoke_run_leaves_everything_behind(smoke):
@@ -50,10 +38,10 @@ def test_smoke_run_leaves_everything_behind(smoke):
     assert not (run_folder / "features").exists()
 
 
-def test_the_same_command_again_says_that_it_is_done(smoke, recipe, monkeypatch, capsys):
+def test_the_same_command_again_says_that_it_is_done(smoke, monkeypatch, capsys):
     folder, first = smoke
     monkeypatch.chdir(folder)
-    recipe.main(recipe.Config(smoke=True))
+    main(Config(smoke=True))
     again = capsys.readouterr().out
     assert "is done" in again
     assert first.stdout.split("\n")[1] in again
@@ -64,7 +52,7 @@ def test_two_seeds_in_processes_on_a_world_model_that_is_there(smoke):
     runs = folder / "runs/decoupled/balance_reaching"
     trained = runs / "position_velocity_recurrent_smoke/world_model"
     arguments = ["--policy", "feedforward", "--seeds", "0,1", "--world_model", str(trained)]
-    result = run(folder, "--smoke", *arguments)
+    result = run(folder, "decoupled", "--smoke", *arguments)
     assert result.returncode == 0, result.stderr
     assert "recording" not in result.stderr
     other = runs / "position_velocity_feedforward_smoke"
@@ -90,9 +78,9 @@ def test_two_seeds_in_processes_on_a_world_model_that_is_there(smoke):
         ({"split": "train"}, "test or validation"),
     ],
 )
-def test_bad_input_is_refused_before_anything_is_written(recipe, tmp_path, settings, message):
+def test_bad_input_is_refused_before_anything_is_written(tmp_path, settings, message):
     with pytest.raises(ValueError, match=message):
-        recipe.main(recipe.Config(run=tmp_path / "bad", **settings))
+        main(Config(run=tmp_path / "bad", **settings))
     assert not (tmp_path / "bad").exists()
 
 
@@ -108,17 +96,17 @@ def test_bad_input_is_refused_before_anything_is_written(recipe, tmp_path, setti
         ("seed_0/policy", {}, "holds no finished run"),
     ],
 )
-def test_a_world_model_of_another_row_is_refused(smoke, recipe, tmp_path, path, settings, message):
+def test_a_world_model_of_another_row_is_refused(smoke, tmp_path, path, settings, message):
     folder, _ = smoke
     trained = folder / "runs/decoupled/balance_reaching/position_velocity_recurrent_smoke" / path
     with pytest.raises(ValueError, match=message):
-        recipe.main(recipe.Config(smoke=True, world_model=trained, run=tmp_path / "bad", **settings))
+        main(Config(smoke=True, world_model=trained, run=tmp_path / "bad", **settings))
     assert not (tmp_path / "bad").exists()
 
 
 @pytest.mark.parametrize("task", sorted({*TASKS} - {"balance_reaching"}))
-def test_smoke_run_of_another_task(recipe, recordings, tmp_path, capsys, task):
-    recipe.main(recipe.Config(smoke=True, task=task, dataset=str(recordings(task)), run=tmp_path))
+def test_smoke_run_of_another_task(recordings, tmp_path, capsys, task):
+    main(Config(smoke=True, task=task, dataset=str(recordings(task)), run=tmp_path))
     evaluation = json.loads((tmp_path / "eval.json").read_text())
     assert (evaluation["task"], evaluation["row"]) == (task, "RGB+[P+V]")
     assert evaluation["world_model"] == {"task": task, "training": "decoupled"}
@@ -129,15 +117,15 @@ def test_smoke_run_of_another_task(recipe, recordings, tmp_path, capsys, task):
 
 
 def test_an_unknown_option_gets_one_clear_line(tmp_path):
-    result = run(tmp_path, "--bogus", "1")
+    result = run(tmp_path, "decoupled", "--bogus", "1")
     assert result.returncode == 2
     assert "unrecognized arguments: --bogus" in result.stderr
     assert "Traceback" not in result.stderr
 
 
-def test_other_settings_on_the_same_folder_are_refused(smoke, recipe, monkeypatch):
+def test_other_settings_on_the_same_folder_are_refused(smoke, monkeypatch):
     folder, _ = smoke
     monkeypatch.chdir(folder)
     existing = Path("runs/decoupled/balance_reaching/position_velocity_recurrent_smoke")
     with pytest.raises(ValueError, match=r"other settings \(beta_z: 0.1 there, 3.0 here\)"):
-        recipe.main(recipe.Config(smoke=True, run=existing, beta_z=3.0))
+        main(Config(smoke=True, run=existing, beta_z=3.0))

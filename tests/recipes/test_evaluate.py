@@ -1,27 +1,19 @@
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
+from commands import run
 
+from dynmap_rl.data import load_meta
+from dynmap_rl.envs import scene_seed
 from dynmap_rl.experts import list_checkpoints
 from dynmap_rl.experts.policy import CHECKPOINTS
-from dynmap_rl.runs import read_json
+from dynmap_rl.modules import make_policy, make_world_model, save_policy, save_world_model
+from dynmap_rl.runs import read_json, write_json
 from recipes.evaluate import Config, main
-
-ROOT = Path(__file__).parents[2]
-
-
-def run(folder, *arguments):
-    command = [sys.executable, str(ROOT / "recipes" / "evaluate.py"), *arguments]
-    return subprocess.run(command, cwd=folder, env=os.environ, capture_output=True, text=True)
 
 
 def test_task_1s_expert_meets_the_obstacle_of_task_2(tmp_path):
     """Named by its task or by its folder: it sees the state of the task that it was trained on."""
     arguments = ["--task", "balance_reaching_obstacle", "--expert", "balance_reaching", "--episodes", "30"]
-    result = run(tmp_path, *arguments, "--split", "validation")
+    result = run(tmp_path, "evaluate", *arguments, "--split", "validation")
     assert result.returncode == 0, result.stderr
     name = f"balance_reaching_obstacle_balance_reaching_{list_checkpoints('balance_reaching')[-1]}_validation"
     rates = read_json(tmp_path / f"runs/evaluate/{name}.json")["rates"]
@@ -31,13 +23,44 @@ def test_task_1s_expert_meets_the_obstacle_of_task_2(tmp_path):
     assert f"{rates['touched']:5.1f} %" in result.stdout
 
     folder, output = str(CHECKPOINTS / "balance_reaching"), tmp_path / "by_folder.json"
-    main(Config("balance_reaching_obstacle", folder, episodes=30, split="validation", output=output))
+    task = "balance_reaching_obstacle"
+    main(Config(task=task, expert=folder, episodes=30, split="validation", output=output))
     assert read_json(output)["rates"] == rates
+
+
+@pytest.fixture
+def trained(recording, tmp_path):
+    """What of a run of task 3 is needed, with a policy that was not trained."""
+    folder, constants = tmp_path / "trained", load_meta(recording)["normalization"]
+    world_model = make_world_model(constants, ("position",))
+    save_world_model(folder / "world_model", world_model)
+    save_policy(folder / "seed_1/policy", make_policy(constants, "recurrent", world_model), world_model)
+    write_json(folder / "config.json", {"task": "bin_dropping"})
+    return folder
+
+
+def test_a_run_and_its_copy_for_lerobot_get_the_same_row(trained, tmp_path):
+    common = "--episodes", "3", "--split", "validation"
+    result = run(tmp_path, "evaluate", "--policy", trained, "--seed", "1", *common)
+    assert result.returncode == 0, result.stderr
+    ours = read_json(tmp_path / "runs/evaluate/bin_dropping_trained_seed_1_validation.json")
+    assert ours["rows"]["first_scene_seed"] == scene_seed("validation", 0)
+    assert f"PE {ours['summary']['PE']:.1f} mm   SR 0.0 %" in result.stdout
+
+    lerobot = pytest.importorskip("dynmap_rl.integrations.lerobot")
+    exported = lerobot.export_to_lerobot(trained, tmp_path / "exported", seed=1)
+    output = tmp_path / "exported.json"
+    arguments = "--task", "bin_dropping", "--output", output
+    result = run(tmp_path, "evaluate", "--policy", exported, *arguments, *common)
+    assert result.returncode == 0, result.stderr
+    assert read_json(output)["rows"] == ours["rows"]
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (["--policy", "nothing"], "nothing holds no policy of LeRobot"),
+        (["--policy", "nothing", "--expert", "balance_reaching"], "name one of them"),
         (["--expert", "nobody"], "no expert at nobody"),
         (["--checkpoint", "iteration_999"], "choose from"),
         (["--episodes", "0"], "at least 1"),
@@ -45,7 +68,7 @@ def test_task_1s_expert_meets_the_obstacle_of_task_2(tmp_path):
     ],
 )
 def test_bad_input_gets_one_clear_line(tmp_path, arguments, message):
-    result = run(tmp_path, *arguments)
+    result = run(tmp_path, "evaluate", *arguments)
     assert result.returncode == 2
     assert message in result.stderr and "Traceback" not in result.stderr
     assert not any(tmp_path.iterdir())

@@ -1,24 +1,20 @@
 """The figures recipe, on small datasets and on runs of untrained networks."""
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import run
 from PIL import Image
 
 from dynmap_rl import data, evaluation
+from dynmap_rl.cells import list_cells
 from dynmap_rl.data import load_meta
 from dynmap_rl.evaluation import scene_seeds
 from dynmap_rl.evaluation.paper_figures import loss_panels
 from dynmap_rl.modules import make_policy, make_world_model, save_policy, save_world_model
-from dynmap_rl.runs import append_metrics, read_json, run_recipe, write_json
+from dynmap_rl.runs import append_metrics, read_json, write_json
 from recipes.figures import POLICIES, WORLD_MODEL, Config, main
-from recipes.tables import list_cells
-
-RECIPE = Path(__file__).parents[2] / "recipes" / "figures.py"
 
 
 def is_drawn(path) -> bool:
@@ -93,22 +89,16 @@ def test_a_dataset_is_recorded_where_there_is_none(tmp_path, monkeypatch):
     assert [path.name for path in Path("datasets").iterdir()] == ["balance_reaching"]
 
 
-def test_a_missing_run_is_named_after_the_other_figures(recording, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(
-        sys, "argv", ["figures.py", "--only", "fig6,fig7,fig8,fig4", "--datasets", str(recording)]
-    )
-    with pytest.raises(SystemExit) as stopped:
-        run_recipe(main, Config)
-    assert stopped.value.code == 2
-    result = capsys.readouterr()
-    assert result.out == "written: runs/figures/fig4.png\n"
-    assert len(result.err.splitlines()) == 1
-    assert f"fig6: no finished run runs/tables/{WORLD_MODEL}; " in result.err
-    assert f"run python recipes/tables.py --only {WORLD_MODEL};" in result.err
+def test_a_missing_run_is_named_after_the_other_figures(recording, tmp_path):
+    result = run(tmp_path, "figures", "--only", "fig6,fig7,fig8,fig4", "--datasets", recording)
+    assert result.returncode == 2
+    assert result.stdout == "written: runs/figures/fig4.png\n"
+    assert len(result.stderr.splitlines()) == 1
+    assert f"fig6: no finished run runs/tables/{WORLD_MODEL}; " in result.stderr
+    assert f"run python recipes/tables.py --only {WORLD_MODEL};" in result.stderr
     source = "balance_reaching_decoupled_none_recurrent"
     both = f"--only {source} and then python recipes/tables.py --only {source.replace('recurrent', 'feedforward')} "
-    assert both in result.err, "a cell that takes a world model waits for it"
+    assert both in result.stderr, "a cell that takes a world model waits for it"
     assert [path.name for path in (tmp_path / "runs/figures").iterdir()] == ["fig4.png"]
 
 
@@ -130,8 +120,7 @@ def test_what_is_there_is_drawn(runs, few_episodes, tmp_path, capsys):
 
 
 def test_an_unknown_figure_gets_one_clear_line(tmp_path):
-    command = [sys.executable, str(RECIPE), "--only", "fig2,fig5"]
-    result = subprocess.run(command, cwd=tmp_path, env=os.environ, capture_output=True, text=True)
+    result = run(tmp_path, "figures", "--only", "fig2,fig5")
     assert result.returncode == 2
     assert "no figure fig5; choose from fig2, fig3, " in result.stderr
     assert len(result.stderr.splitlines()) == 1

@@ -1,10 +1,6 @@
 """Decoupled and joint training on a dataset of no task of ours, as commands."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
+import commands
 import pytest
 import torch
 from foreign_dataset import make_foreign
@@ -13,12 +9,9 @@ from dynmap_rl.data import add_dynamics
 from dynmap_rl.modules import load_policy, load_world_model
 from dynmap_rl.runs import read_json, read_metrics
 
-RECIPES = Path(__file__).parents[2] / "recipes"
-
 
 def run(folder, recipe, *arguments):
-    command = [sys.executable, str(RECIPES / f"{recipe}.py"), "--task", "none", "--smoke", *arguments]
-    return subprocess.run(command, cwd=folder, env=os.environ, capture_output=True, text=True)
+    return commands.run(folder, recipe, "--task", "none", "--smoke", *arguments)
 
 
 @pytest.fixture(scope="module")

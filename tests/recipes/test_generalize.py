@@ -1,10 +1,8 @@
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from commands import place_recordings, run
 from safetensors.torch import load_file, save_file
 
 from dynmap_rl.data import load_meta
@@ -13,18 +11,12 @@ from dynmap_rl.runs import read_json, write_json
 from dynmap_rl.training import fingerprint
 from recipes.generalize import Config, main
 
-ROOT = Path(__file__).parents[2]
-
-
-def run(folder, recipe, *arguments):
-    command = [sys.executable, str(ROOT / "recipes" / f"{recipe}.py"), *arguments]
-    return subprocess.run(command, cwd=folder, env=os.environ, capture_output=True, text=True)
-
 
 @pytest.fixture(scope="module")
-def smoke(tmp_path_factory):
+def smoke(tmp_path_factory, recordings):
     """A smoke run of task 1, and its world model taken to task 3."""
     folder = tmp_path_factory.mktemp("smoke")
+    place_recordings(folder, recordings, "balance_reaching", "bin_dropping")
     source = run(folder, "decoupled", "--smoke", "--supervision", "none")
     assert source.returncode == 0, source.stderr
     trained = "runs/decoupled/balance_reaching/none_recurrent_smoke"

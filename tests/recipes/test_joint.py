@@ -1,20 +1,9 @@
 """Joint and end-to-end training as commands."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
+from commands import place_recordings, run
 
 from dynmap_rl.runs import read_json
-
-RECIPES = Path(__file__).parents[2] / "recipes"
-
-
-def run(folder, recipe, *arguments):
-    command = [sys.executable, str(RECIPES / f"{recipe}.py"), *arguments]
-    return subprocess.run(command, cwd=folder, env=os.environ, capture_output=True, text=True)
 
 
 @pytest.mark.parametrize(
@@ -29,8 +18,9 @@ def run(folder, recipe, *arguments):
         ("end_to_end", "recurrent", "End-to-End", "DR 19 (9.0) %   PE 71 (21.9) mm   SR 57 (10.6) %"),
     ],
 )
-def test_smoke_run_and_its_world_model_taken_to_task_3(recording, tmp_path, recipe, name, row, paper):
-    arguments = "--smoke", "--seeds", "0,1", "--dataset", str(recording)
+def test_smoke_run_and_its_world_model_taken_to_task_3(recordings, tmp_path, recipe, name, row, paper):
+    place_recordings(tmp_path, recordings, "balance_reaching", "bin_dropping")
+    arguments = "--smoke", "--seeds", "0,1"
     result = run(tmp_path, recipe, *arguments)
     assert result.returncode == 0, result.stderr
     assert paper in result.stdout

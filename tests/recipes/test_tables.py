@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import commands
 import pytest
 
 from dynmap_rl.cells import list_cells
@@ -14,9 +15,11 @@ from dynmap_rl.evaluation.paper import TABLES, parse_supervision, row_name
 RECIPE = Path(__file__).parents[2] / "recipes" / "tables.py"
 
 
+TASKS = "balance_reaching", "balance_reaching_obstacle", "bin_dropping"
+
+
 def run(folder, *arguments):
-    command = [sys.executable, str(RECIPE), "--results", "results", *arguments]
-    return subprocess.run(command, cwd=folder, env=os.environ, capture_output=True, text=True)
+    return commands.run(folder, "tables", "--results", "results", *arguments)
 
 
 def test_there_is_a_cell_for_every_one_of_the_paper():
@@ -39,14 +42,12 @@ def test_there_is_a_cell_for_every_one_of_the_paper():
     assert found == expected
 
 
-def test_cells_run_once_and_are_printed_beside_the_paper(tmp_path):
+def test_cells_run_once_and_are_printed_beside_the_paper(recordings, tmp_path):
+    commands.place_recordings(tmp_path, recordings, *TASKS)
     smoke = "--smoke", "--only", "joint_none"
     result = run(tmp_path, *smoke)
     assert result.returncode == 0, result.stderr
-    names = [
-        f"{task}_joint_none_recurrent"
-        for task in ("balance_reaching", "balance_reaching_obstacle", "bin_dropping")
-    ]
+    names = [f"{task}_joint_none_recurrent" for task in TASKS]
     assert [line.removeprefix("done: ") for line in result.stdout.splitlines()] == names
     assert sorted(p.stem for p in (tmp_path / "results").iterdir()) == sorted(names)
 
@@ -67,19 +68,21 @@ def test_cells_run_once_and_are_printed_beside_the_paper(tmp_path):
     assert dry.count("   done  ") == 3 and "3 of 69 cells are done" in dry
 
 
-def test_ray_runs_the_same_cells(tmp_path, monkeypatch):
-    ray = pytest.importorskip("ray")
+def test_ray_runs_the_same_cells(recordings, tmp_path, monkeypatch):
+    pytest.importorskip("ray")
+    commands.place_recordings(tmp_path, recordings, *TASKS[:2])
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     (tmp_path / "runs/tables/bin_dropping_joint_none_recurrent").mkdir(parents=True)
     (tmp_path / "runs/tables/bin_dropping_joint_none_recurrent/config.json").write_text("{}")
-    result = run(tmp_path, "--smoke", "--only", "joint_none", "--launcher", "ray", "--cpus", "1")
+    command = [sys.executable, str(RECIPE), "--results", "results", "--smoke", "--only", "joint_none"]
+    command += ["--launcher", "ray", "--cpus", "1"]
+    result = subprocess.run(command, cwd=tmp_path, env=os.environ, capture_output=True, text=True)
     names = ["balance_reaching_joint_none_recurrent", "balance_reaching_obstacle_joint_none_recurrent"]
     assert [line.removeprefix("done: ") for line in result.stdout.splitlines()] == names, result.stderr
     assert sorted(p.stem for p in (tmp_path / "results").iterdir()) == sorted(names)
     assert result.returncode == 2
     assert "bin_dropping_joint_none_recurrent failed; see runs/tables/" in result.stderr
-    assert not ray.is_initialized()  # the cluster ended with the recipe
 
 
 def test_a_cell_that_fails_says_where_to_look_and_the_others_go_on(tmp_path):

@@ -5,8 +5,9 @@ Importing it registers the environment ``dynmap`` and the policy ``dynmap``. LeR
 ``dynmap_rl/integrations/lerobot_policy_dynmap`` is installed.
 """
 
+from .actor import LeRobotActor
 from .configuration_dynmap import DynmapConfig
 from .environment import DynmapEnvConfig
 from .export import export_to_lerobot, import_from_lerobot
 
-__all__ = ["DynmapConfig", "DynmapEnvConfig", "export_to_lerobot", "import_from_lerobot"]
+__all__ = ["DynmapConfig", "DynmapEnvConfig", "LeRobotActor", "export_to_lerobot", "import_from_lerobot"]

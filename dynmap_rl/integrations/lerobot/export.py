@@ -28,9 +28,8 @@ def export_to_lerobot(run: str | Path, folder: str | Path, seed: int = 0) -> Pat
         ValueError: the run holds no such policy, or one of another scene than ours.
     """
     run, folder = Path(run), Path(folder)
-    own = run / f"seed_{seed}" / "world_model"  # joint training has one for each seed
-    world_model = modules.load_world_model(own if own.exists() else run / "world_model")
-    policy = modules.load_policy(run / f"seed_{seed}" / "policy")
+    actor = modules.load_actor(run, seed)
+    world_model, policy = actor.world_model, actor.policy
     sizes = {"action": policy.action.size, "goal": policy.goal.size}
     sizes |= {name: n.size for name, n in world_model.dynamics_decoder.normalizers.items()}
     if other := {name: size for name, size in sizes.items() if size != SIZES[name]}:

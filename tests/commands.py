@@ -1,0 +1,44 @@
+"""Recipes as commands, but in the tests' own process: a process of their own would import everything again."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+import sys
+from pathlib import Path
+from subprocess import CompletedProcess
+from unittest import mock
+
+import torch
+
+from dynmap_rl.runs import run_recipe
+
+
+def run(folder: Path, recipe: str, *arguments: str) -> CompletedProcess:
+    """``python recipes/RECIPE.py ARGUMENTS`` in a folder: its exit code and what it printed."""
+    module = importlib.import_module(f"recipes.{recipe}")
+    out, err, threads, code = io.StringIO(), io.StringIO(), torch.get_num_threads(), 0
+    try:
+        with (
+            contextlib.chdir(folder),
+            mock.patch.object(sys, "argv", [module.__file__, *map(str, arguments)]),
+            mock.patch.object(sys, "path", [*sys.path]),
+            contextlib.redirect_stdout(out),
+            contextlib.redirect_stderr(err),
+        ):
+            run_recipe(module.main, module.Config)
+    except SystemExit as end:
+        code = end.code
+        if isinstance(code, str):
+            code = print(code, file=err) or 1
+    finally:
+        torch.set_num_threads(threads)
+    return CompletedProcess([recipe, *arguments], code or 0, out.getvalue(), err.getvalue())
+
+
+def place_recordings(folder: Path, recordings, *tasks: str) -> None:
+    """Where a smoke run looks for its datasets, the ones that the tests share."""
+    (folder / "datasets").mkdir(exist_ok=True)
+    for task in tasks:
+        (folder / "datasets" / f"{task}_smoke").symlink_to(recordings(task), target_is_directory=True)
