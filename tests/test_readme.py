@@ -101,3 +101,31 @@ def test_the_speed_table_is_that_of_the_results(monkeypatch):
     monkeypatch.syspath_prepend(ROOT / "tests/benchmarks")
     benchmarks = importlib.import_module("run")
     assert benchmarks.markdown(json.loads(benchmarks.RESULTS.read_text())) in README
+
+
+def test_errors_of_derived_dynamics_are_those_of_the_results():
+    facts = json.loads((ROOT / "recipes/results/derivatives.json").read_text())
+    text, derived, tracked = " ".join(README.split()), facts["derived"], facts["tracked"]
+
+    def mm(kind):
+        return f"{1000 * derived[kind]['velocity']['linear']:.0f}"
+
+    means = {name: values["linear"] for name, values in facts["mean_magnitude"].items()}
+    acceleration = derived["central"]["acceleration"]["linear"]
+    for sentence in (
+        f"velocities are off by {mm('central')} mm/s (their mean is {1000 * means['velocity']:.0f})",
+        f"accelerations by {acceleration:.2f} m/s^2 ({means['acceleration']:.2f})",
+        f"velocities are off by {mm('central, noisy')} mm/s, with `--method savgol` by {mm('savgol, noisy')}",
+        f"picture's x is {1000 * tracked['x_error_m']:.0f} mm ({64 * tracked['x_error_m']:.1f} pixels) off",
+        f"correlates with the cart's by {tracked['velocity_correlation']:.2f}",
+    ):
+        assert sentence in text
+
+
+def test_memory_is_that_of_the_results():
+    peak = json.loads((ROOT / "recipes/results/memory.json").read_text())["peak"]
+    text = " ".join(README.split())
+    assert peak["decoupled"] < 4
+    for name in ("decoupled", "generalize", "collect", "expert", "evaluate"):
+        assert re.search(rf"`{name}` {peak[name]:.1f}", text), name
+    assert f"`joint` and `end_to_end` {peak['joint']:.1f}" in text
