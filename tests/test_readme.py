@@ -129,3 +129,18 @@ def test_memory_is_that_of_the_results():
     for name in ("decoupled", "generalize", "collect", "expert", "evaluate"):
         assert re.search(rf"`{name}` {peak[name]:.1f}", text), name
     assert f"`joint` and `end_to_end` {peak['joint']:.1f}" in text
+
+
+def test_ppo_on_latents_is_that_of_the_results():
+    facts = json.loads((ROOT / "recipes/results/latent_ppo_balance_reaching.json").read_text())
+    latents, states = facts["latents"], facts["states"]
+    text = " ".join(README.split())
+    assert (
+        f"in {100 * latents['success']:.1f} % of 1,000 fresh scenes, {1000 * latents['position_error']:.1f} mm off on "
+        f"average, after {latents['frames']:,} frames ({latents['seconds'] / 60:.0f} minutes of one core;"
+        in text
+    )
+    assert (
+        f"PPO on states in {100 * states['success']:.1f} %, {1000 * states['position_error']:.1f} mm off"
+        in text
+    )
