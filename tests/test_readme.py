@@ -144,3 +144,25 @@ def test_ppo_on_latents_is_that_of_the_results():
         f"PPO on states in {100 * states['success']:.1f} %, {1000 * states['position_error']:.1f} mm off"
         in text
     )
+
+
+def test_what_a_world_model_knows_is_that_of_the_results():
+    facts = json.loads((ROOT / "recipes/results/probe.json").read_text())
+    without, with_dynamics = (
+        facts["probes"][f"{row}, decoupled"]["hidden2"] for row in ("Only-RGB", "RGB+[P+V]")
+    )
+    text = " ".join(README.split())
+
+    def r2(values):
+        return f"{sum(values) / len(values):.2f}"
+
+    assert (
+        f"`hidden2` with an R^2 of {r2(with_dynamics['position'])} (Only-RGB: {r2(without['position'])}), "
+        f"velocities with {r2(with_dynamics['velocity'])} ({r2(without['velocity'])})"
+    ) in text
+    errors = facts["open_loop"]["RGB+[P+V], decoupled"]
+    model, still = errors["model"], errors["still"]
+    assert (
+        f"the cart is {model['cart_mm'][-1]:.0f} mm off and the block {model['block_mm'][-1]:.0f} mm, where standing "
+        f"still would be {still['cart_mm'][-1]:.0f} mm off" in text
+    )
