@@ -137,7 +137,7 @@ def test_ppo_on_latents_is_that_of_the_results():
     text = " ".join(README.split())
     assert (
         f"in {100 * latents['success']:.1f} % of 1,000 fresh scenes, {1000 * latents['position_error']:.1f} mm off on "
-        f"average, after {latents['frames']:,} frames ({latents['seconds'] / 60:.0f} minutes of one core;"
+        f"average, after {latents['frames']:,} frames ({latents['seconds'] / 60:.0f} minutes of one core)"
         in text
     )
     assert (
