@@ -1,5 +1,6 @@
 """Judge a trained policy, or an expert, on a task's test scenes.
 
+    python recipes/evaluate.py --policy balance_reaching                             # ships with the package
     python recipes/evaluate.py --policy runs/decoupled/balance_reaching/position_velocity_recurrent
     python recipes/evaluate.py --policy runs/act/checkpoints/last/pretrained_model   # any policy of LeRobot
     python recipes/evaluate.py --expert balance_reaching --task balance_reaching_obstacle
@@ -17,7 +18,8 @@ from dynmap_rl.runs import run_recipe
 
 @dataclass
 class Config:
-    # Run folder of ours, or a pretrained_model folder of LeRobot, or its id on the Hugging Face hub.
+    # Run folder of ours, or balance_reaching, which ships with the package; or a pretrained_model folder of LeRobot, or
+    # its id on the Hugging Face hub.
     policy: str | None = None
     # Which of a run's policies.
     seed: int = 0
@@ -52,10 +54,10 @@ def main(config: Config) -> None:
 def judge_policy(config: Config) -> tuple[str, dict]:
     """The name of the result, and the result: ``DR``, ``PE``, ``SR`` and what became of every episode."""
     from dynmap_rl.evaluation import evaluate
-    from dynmap_rl.modules import load_actor
+    from dynmap_rl.modules import find_run, load_actor
     from dynmap_rl.runs import read_json
 
-    folder, settings = Path(config.policy), {}
+    folder, settings = find_run(config.policy), {}
     if (folder / f"seed_{config.seed}").exists():
         actor, settings = load_actor(folder, config.seed), read_json(folder / "config.json")
     else:

@@ -66,6 +66,8 @@ def test_every_option_and_file_that_the_readme_names_exists():
             "evaluate",
             "tables",
             "add_dynamics",
+            "play",
+            "probe",
         )
     )
     for option in options:
@@ -166,3 +168,11 @@ def test_what_a_world_model_knows_is_that_of_the_results():
         f"the cart is {model['cart_mm'][-1]:.0f} mm off and the block {model['block_mm'][-1]:.0f} mm, where standing "
         f"still would be {still['cart_mm'][-1]:.0f} mm off" in text
     )
+
+
+def test_the_shipped_policy_is_that_of_the_results():
+    facts = json.loads((ROOT / "recipes/results/pretrained_balance_reaching.json").read_text())
+    assert facts["command"].startswith("python recipes/evaluate.py --policy balance_reaching ")
+    low, high = facts["summary"]["SR_interval"]
+    rate, error = facts["summary"]["SR"], facts["summary"]["PE"]
+    assert f"[SR {rate:.1f} % [{low:.1f}, {high:.1f}], PE {error:.1f} mm]" in README

@@ -29,8 +29,8 @@ at {fps} Hz.
 
 ![The first episodes, a row each]({picture})
 
-How it was made: PyMunk simulates, pygame draws, state-based PPO experts act: {selection}. The command was
-`python recipes/collect.py --task {task} --kind {kind_option} --episodes {train} --eval_episodes {eval}`.
+How it was made: PyMunk simulates, pygame draws, {maker}. The command was
+`python recipes/{command}`.
 
 | column | shape | content |
 |---|---|---|
@@ -86,20 +86,27 @@ def draw_episodes(episodes: TensorDict, path: Path, rows: int = 3, columns: int 
 
 
 def _describe(meta: dict, instruction: str) -> str:
-    exploring = meta["kind"] == "exploration"
-    splits = meta["splits"]
+    splits, task, kind = meta["splits"], meta["task"], meta["kind"]
+    train, test = (end - first for first, end in (splits["train"], splits["eval"]))
+    collect = f"collect.py --task {task} --kind {kind} --episodes {train} --eval_episodes {test}"
+    maker, command = {
+        "demonstrations": (
+            "state-based PPO experts act; successful episodes, most with short pushes",
+            collect,
+        ),
+        "exploration": ("state-based PPO experts act, with noise and detours", collect),
+        "human": ("a person drives; successful episodes", f"play.py --task {task} --record FOLDER"),
+    }[kind]
     return DESCRIPTION.format(
-        kind=meta["kind"].capitalize(),
-        kind_option=meta["kind"],
-        task=meta["task"],
+        kind="Demonstrations of a person" if kind == "human" else kind.capitalize(),
+        task=task,
         instruction=instruction,
         episodes=len(meta["episodes"]),
         steps=EPISODE_STEPS,
         fps=FPS,
         picture=PICTURE,
-        selection="with noise and detours" if exploring else "successful episodes, most with short pushes",
-        train=splits["train"][1],
-        eval=splits["eval"][1] - splits["eval"][0],
+        maker=maker,
+        command=command,
         dt=CONTROL_DT,
         meta=META,
         splits=", ".join(f"{name} {first} to {end - 1}" for name, (first, end) in splits.items()),

@@ -161,7 +161,7 @@ def _record(root: Path, parts: Path, settings: dict, workers: int) -> None:
         for shard in _run_shards(todo, workers):
             progress.update(shard.count)
     merged = parts / "merged.tmp"
-    _merge(shards, merged, settings)
+    merge_shards(shards, merged, settings)
     merged.replace(root)
 
 
@@ -210,7 +210,7 @@ def _record_shard(shard: Shard) -> None:
         torch.set_num_threads(threads)
     temporary = shard.folder.with_name(f"{shard.folder.name}.tmp")
     write_episodes(temporary, episodes, get_task(shard.task).description)
-    rows = [_describe(shard.task, *e) for e in zip(plans, episodes, strict=True)]
+    rows = [describe_episode(shard.task, *e) for e in zip(plans, episodes, strict=True)]
     write_json(temporary / ROWS, rows)
     temporary.replace(shard.folder)
 
@@ -242,7 +242,8 @@ def _plan(shard: Shard, start: int, count: int) -> list[Plan]:
     return plan_exploration(shard.task, "exploration", offset + start, count, shard.expert)
 
 
-def _describe(task: str, plan: Plan, episode: TensorDict) -> dict:
+def describe_episode(task: str, plan: Plan, episode: TensorDict) -> dict:
+    """An episode's row of the metadata."""
     scene = get_task(task).sample_scene(np.random.default_rng(plan.scene_seed))
     end = episode["next"][-1]
     return {
@@ -254,7 +255,8 @@ def _describe(task: str, plan: Plan, episode: TensorDict) -> dict:
     }
 
 
-def _merge(shards: list[Shard], folder: Path, settings: dict) -> None:
+def merge_shards(shards: list[Shard], folder: Path, settings: dict) -> None:
+    """All episodes of shards as one dataset with its metadata; the first ``episodes`` of the settings are for training."""
     rows = [{"split": s.split, **row} for s in shards for row in read_json(s.folder / ROWS)]
     train = settings["episodes"]
     splits = {"train": [0, train], "eval": [train, len(rows)]}

@@ -2,6 +2,7 @@
 
 from .checkpoints import (
     check_policy,
+    find_run,
     load_actor,
     load_policy,
     load_world_model,
@@ -37,6 +38,7 @@ __all__ = [
     "WorldModel",
     "check_policy",
     "delay",
+    "find_run",
     "load_actor",
     "load_policy",
     "load_world_model",

@@ -13,6 +13,7 @@ from .policy import FeedforwardPolicy, RecurrentPolicy
 from .tensordict_modules import Actor
 from .world_model import WorldModel
 
+SHIPPED = Path(__file__).parents[1] / "pretrained"
 POLICIES = {"feedforward": FeedforwardPolicy, "recurrent": RecurrentPolicy}
 
 
@@ -90,17 +91,27 @@ def load_policy(folder: Path) -> FeedforwardPolicy | RecurrentPolicy:
     return policy.eval()
 
 
-def load_actor(run: Path, seed: int = 0) -> Actor:
-    """World model and policy of a run folder (of ``recipes/decoupled.py``, ``joint.py``, ``end_to_end.py`` or
-    ``generalize.py``) as they act in its evaluation.
+def load_actor(run: str | Path, seed: int = 0) -> Actor:
+    """World model and policy of a run as they act in its evaluation.
+
+    Args:
+        run: a run folder of ``recipes/decoupled.py``, ``joint.py``, ``end_to_end.py`` or ``generalize.py``, or
+            ``"balance_reaching"``: a run of task 1 ships with the package.
+        seed: of the policy.
 
     Raises:
         ValueError: the folder holds no policy of that seed.
     """
-    run = Path(run)
+    run = find_run(run)
     own = run / f"seed_{seed}" / "world_model"  # joint training has one for each seed
     world_model = load_world_model(own if own.exists() else run / "world_model")
     return Actor(world_model, load_policy(run / f"seed_{seed}" / "policy"), mixed=True)
+
+
+def find_run(run: str | Path) -> Path:
+    """The folder of a run that ships with the package, by its name, or else the path itself."""
+    shipped = SHIPPED / run
+    return shipped if shipped.is_dir() else Path(run)
 
 
 def _read_arguments(folder: Path) -> dict:

@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import pytest
 from commands import run
 
@@ -54,6 +56,14 @@ def test_a_run_and_its_copy_for_lerobot_get_the_same_row(trained, tmp_path):
     result = run(tmp_path, "evaluate", "--policy", exported, *arguments, *common)
     assert result.returncode == 0, result.stderr
     assert read_json(output)["rows"] == ours["rows"]
+
+
+def test_the_shipped_policy_does_as_well_as_its_results_say(tmp_path):
+    result = run(tmp_path, "evaluate", "--policy", "balance_reaching", "--episodes", "20")
+    assert result.returncode == 0, result.stderr
+    ours = read_json(tmp_path / "runs/evaluate/balance_reaching_balance_reaching_seed_0_test.json")
+    facts = read_json(Path(__file__).parents[2] / "recipes/results/pretrained_balance_reaching.json")
+    assert ours["rows"]["success"] == facts["rows"]["success"][:20]
 
 
 @pytest.mark.parametrize(

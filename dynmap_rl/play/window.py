@@ -1,0 +1,156 @@
+"""The window: the scene, what the world model sees in it, and traces of the dynamics, true and predicted."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dynmap_rl.envs.renderer import Renderer, pygame
+from dynmap_rl.envs.world import ACCELERATION_LIMIT, EPISODE_STEPS, VELOCITY_LIMIT
+from dynmap_rl.modules import DYNAMICS
+
+from .session import Session
+
+BLACK, GRAY, LIGHT, WHITE, GREEN = (0, 0, 0), (120, 120, 120), (225, 225, 225), (255, 255, 255), (44, 160, 44)
+LINE, MARGIN, TRACE = 20, 8, 84  # pixels
+COMPONENTS = "x", "y", "theta"
+UNITS = {"position": "m", "velocity": "m/s", "acceleration": "m/s2"}
+LOW = {"position": [0, 0, -0.5], "velocity": -VELOCITY_LIMIT, "acceleration": -2 * ACCELERATION_LIMIT}
+HIGH = {"position": [1, 1, 0.5], "velocity": VELOCITY_LIMIT, "acceleration": 2 * ACCELERATION_LIMIT}
+HELP = (
+    "arrows or WASD: move; Q, E: tilt; mouse button: go there",
+    "TAB: who drives; I: imagination; B: cart or block",
+    "R: next scene; SPACE: pause; ESC: end",
+)
+KEYS = {  # axis and sign
+    "left": (0, -1), "a": (0, -1), "right": (0, 1), "d": (0, 1), "down": (1, -1), "s": (1, -1), "up": (1, 1),
+    "w": (1, 1), "e": (2, -1), "q": (2, 1),
+}  # fmt: skip
+
+
+class PlayWindow:
+    """Shows a session, and hands it what keys and mouse say.
+
+    Args:
+        session: what is played.
+        size: side of the scene, in pixels.
+    """
+
+    def __init__(self, session: Session, size: int = 384):
+        self.session, self.size = session, size
+        self.body, self.paused, self.open = 3, False, True
+        self.held: set[str] = set()
+        pygame.display.init(), pygame.font.init()
+        pygame.display.set_caption("dynmap_rl")
+        self.width = 2 * size + 3 * MARGIN
+        self.height = size + 3 * MARGIN + 3 * LINE + len(DYNAMICS) * TRACE
+        self.screen = pygame.display.set_mode((self.width, self.height))
+        self.font = pygame.font.Font(None, LINE)
+        self.renderer = Renderer(size, supersample=2)
+
+    def close(self) -> None:
+        pygame.display.quit()
+
+    def handle(self) -> None:
+        """Take in what was pressed since the last time."""
+        for event in pygame.event.get():
+            if event.type == pygame.QUIT:
+                self.open = False
+            elif event.type == pygame.KEYDOWN:
+                self._press(pygame.key.name(event.key))
+            elif event.type == pygame.KEYUP:
+                self.held.discard(pygame.key.name(event.key))
+            elif event.type in (pygame.MOUSEBUTTONDOWN, pygame.MOUSEMOTION):
+                self._point(event)
+            elif event.type == pygame.MOUSEBUTTONUP:
+                self.session.hand.target = None
+        direction = np.zeros(3)
+        for axis, sign in (KEYS[key] for key in self.held):
+            direction[axis] += sign
+        self.session.hand.direction = direction.clip(-1, 1)
+
+    def _press(self, key: str) -> None:
+        session = self.session
+        if key in KEYS:
+            self.held.add(key)
+            session.driver = "hand"
+        elif key == "escape":
+            self.open = False
+        elif key == "space":
+            self.paused = not self.paused
+        elif key == "r":
+            session.restart()
+        elif key == "b":
+            self.body = 3 - self.body
+        elif key == "i" and session.actor:
+            session.imagining = not session.imagining
+        elif key == "tab":
+            drivers = session.drivers
+            session.driver = drivers[(drivers.index(session.driver) + 1) % len(drivers)]
+
+    def _point(self, event) -> None:
+        pressed = event.type == pygame.MOUSEBUTTONDOWN or event.buttons[0]
+        x, y = (event.pos[0] - MARGIN) / self.size, 1 - (event.pos[1] - MARGIN - LINE) / self.size
+        if pressed and 0 <= x <= 1 and 0 <= y <= 1:
+            self.session.driver, self.session.hand.target = "hand", (x, y)
+
+    def draw(self) -> np.ndarray:
+        """Show the present; the picture uint8 ``[height, width, 3]``."""
+        session, size = self.session, self.size
+        self.screen.fill(WHITE)
+        self._write(f"{session.env.task.name}: {session.driver} drives", MARGIN, MARGIN)
+        self._show(self.renderer.draw(session.world, session.env.task), MARGIN)
+        right = 2 * MARGIN + size
+        if "pixels" in session.prediction:
+            source = (
+                "imagination, without frames" if session.imagining else "prediction from the frame before"
+            )
+            self._write(f"world model: {source}", right, MARGIN)
+            self._show(session.prediction["pixels"], right)
+        else:
+            for i, line in enumerate(HELP):
+                self._write(line, right, MARGIN + LINE * (i + 2), GRAY)
+        self._write(self._status(), MARGIN, 2 * MARGIN + LINE + size)
+        for row, quantity in enumerate(DYNAMICS):
+            for column in range(3):
+                self._trace(quantity, column, row)
+        pygame.display.flip()
+        return pygame.surfarray.array3d(self.screen).swapaxes(0, 1)
+
+    def _status(self) -> str:
+        session, world = self.session, self.session.world
+        name = "block" if self.body else "cart"
+        state = (
+            "success"
+            if session.succeeded
+            else "dropped"
+            if world.dropped
+            else f"{1000 * world.goal_distance:.0f} mm to go"
+        )
+        return (
+            f"step {world.steps} of {EPISODE_STEPS}; {state}; {name}'s dynamics: black true, green predicted"
+            + ("; paused" if self.paused else "")
+        )
+
+    def _show(self, frame: np.ndarray, x: int) -> None:
+        image = pygame.image.frombuffer(np.ascontiguousarray(frame), frame.shape[1::-1], "RGB")
+        self.screen.blit(pygame.transform.scale(image, (self.size, self.size)), (x, MARGIN + LINE))
+
+    def _write(self, text: str, x: int, y: int, color=BLACK) -> None:
+        self.screen.blit(self.font.render(text, True, color), (x, y))
+
+    def _trace(self, quantity: str, column: int, row: int) -> None:
+        width = (self.width - 4 * MARGIN) // 3
+        left = MARGIN + column * (width + MARGIN)
+        top = 2 * MARGIN + 2 * LINE + self.size + row * TRACE
+        area = pygame.Rect(left, top + LINE - 4, width, TRACE - LINE - 2)
+        unit = UNITS[quantity] if column < 2 else UNITS[quantity].replace("m", "rad", 1)
+        self._write(f"{quantity} {COMPONENTS[column]} [{unit}]", left, top, GRAY)
+        pygame.draw.rect(self.screen, LIGHT, area, 1)
+        low, high = LOW[quantity][column], HIGH[quantity][column]
+        for kind, color in (("true", BLACK), ("predicted", GREEN)):
+            values = np.array(self.session.trace[quantity, kind])[:, self.body + column]
+            steps = np.flatnonzero(np.isfinite(values))
+            if len(steps) > 1:
+                x = area.left + steps / EPISODE_STEPS * area.width
+                y = area.bottom - ((values[steps] - low) / (high - low)).clip(0, 1) * area.height
+                pygame.draw.lines(self.screen, color, False, np.stack([x, y], 1).tolist())

@@ -1,0 +1,118 @@
+"""Play a task, watch an expert or a policy at it, look into its world model, record demonstrations of your own.
+
+    python recipes/play.py --task bin_dropping
+    python recipes/play.py --policy balance_reaching    # ships with the package; or a run folder
+    python recipes/play.py --record datasets/mine
+
+Arrows or WASD move the cart, Q and E tilt it, a pressed mouse button calls it; TAB changes who drives: you, the expert
+or the policy. With a policy the window shows what its world model predicts, one step ahead or, in imagination (I), on
+and on without frames, beside the simulator. B shows the dynamics of cart or block, R takes the next scene, SPACE
+pauses, ESC ends.
+
+With --record, every successful episode that you alone drove is kept at once; at the end they become a LeRobot dataset with
+dynamics columns, and the next session adds to it.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from dynmap_rl.runs import run_recipe
+
+
+@dataclass
+class Config:
+    # Name of the task: balance_reaching, balance_reaching_obstacle, bin_dropping, or module:Class of your own; by
+    # default the one that the policy was trained on, otherwise balance_reaching.
+    task: str | None = None
+    # Run folder of ours with world model and policy, or balance_reaching, which ships with the package; and which of
+    # its policies.
+    policy: str | None = None
+    seed: int = 0
+    # Expert: the name of the task that it ships for, or a folder of checkpoints; by default the task's own.
+    expert: str | None = None
+    # Who drives at first: hand, expert or policy; by default the policy where there is one.
+    driver: str | None = None
+    # Number of the first scene.
+    scene: int = 0
+    # Folder of a LeRobot dataset for your demonstrations.
+    record: Path | None = None
+    # Side of the scene on the screen, in pixels.
+    size: int = 384
+    # End after so many steps (for films); and an animation of the window as a GIF.
+    steps: int | None = None
+    gif: Path | None = None
+
+
+def main(config: Config) -> None:
+    from dynmap_rl.data.human import list_shards, open_folder, publish_episodes
+    from dynmap_rl.envs.tasks import get_task
+    from dynmap_rl.envs.world import CONTROL_DT
+    from dynmap_rl.modules import find_run, load_actor
+    from dynmap_rl.play import PlayWindow, Session
+    from dynmap_rl.runs import read_json
+
+    actor = load_actor(config.policy, config.seed) if config.policy else None
+    trained_on = read_json(find_run(config.policy) / "config.json").get("task") if config.policy else None
+    task = config.task or trained_on or "balance_reaching"
+    get_task(task)
+    if config.record:
+        open_folder(config.record, task)
+    session = Session(task, actor, config.expert, config.scene)
+    if config.driver:
+        if config.driver not in session.drivers:
+            raise ValueError(f"--driver is one of {', '.join(session.drivers)}, not {config.driver!r}")
+        session.driver = config.driver
+    window, frames = PlayWindow(session, config.size), []
+    try:
+        play(config, session, window, frames, CONTROL_DT)
+    finally:
+        window.close()
+        if config.record and (count := len(list_shards(config.record, task))) > 1:
+            print(f"{count} episodes: {publish_episodes(config.record, task)}")
+    if config.gif:
+        save_film(frames, config.gif)
+
+
+def play(config: Config, session, window, frames: list, dt: float) -> None:
+    """Until the window is closed, or for a number of steps."""
+    from dynmap_rl.data import keep_episode
+    from dynmap_rl.envs.renderer import pygame
+
+    clock, step, waited = pygame.time.Clock(), 0, 0
+    while window.open and step != config.steps:
+        window.handle()
+        was_over = session.over
+        if not window.paused:
+            session.step()
+            step += 1
+        picture = window.draw()
+        if config.gif:
+            frames.append(picture)
+        if (
+            session.over
+            and not was_over
+            and config.record
+            and session.drove == {"hand"}
+            and session.succeeded
+        ):
+            count = keep_episode(config.record, session.env.task.name, session.episode(), session.scene_seed)
+            print(f"kept: {count} episodes in {config.record}.parts", flush=True)
+        waited = waited + 1 if session.over and not window.paused else 0
+        if waited > 1 / dt:  # a second to see how it ended
+            session.restart()
+        clock.tick(1 / dt if config.steps is None else 0)
+
+
+def save_film(frames: list, path: Path) -> None:
+    """One picture in two, at half size, in real time."""
+    from PIL import Image
+
+    images = [Image.fromarray(frame) for frame in frames[::2]]
+    images = [image.resize((image.width // 2, image.height // 2)).quantize(64) for image in images]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    images[0].save(path, save_all=True, append_images=images[1:], duration=100, loop=0, optimize=True)
+    print(f"written: {path}")
+
+
+if __name__ == "__main__":
+    run_recipe(main, Config)

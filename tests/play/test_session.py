@@ -1,0 +1,110 @@
+"""What drives a played world, and what the world model says of it, without a window."""
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from dynmap_rl.data import load_meta
+from dynmap_rl.envs import DynmapBatchedEnv, scene_seed
+from dynmap_rl.envs.tasks import TASKS
+from dynmap_rl.evaluation import roll_out
+from dynmap_rl.modules import Actor, make_policy, make_world_model
+from dynmap_rl.play import Hand, Session
+
+
+@pytest.fixture(scope="module")
+def actor(recording):
+    torch.manual_seed(0)
+    constants = load_meta(recording)["normalization"]
+    world_model = make_world_model(constants, ("position", "velocity"), latent_size=16, hidden_size=24)
+    return Actor(world_model.eval(), make_policy(constants, "recurrent", world_model, width=16).eval())
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_expert_succeeds_and_its_episode_is_a_demonstration(task):
+    session = Session(task)
+    session.driver = "expert"
+    while not session.over:
+        session.step()
+    session.step()  # nothing: it is over
+    assert session.succeeded and session.drove == {"expert"}
+    episode = session.episode()
+    assert episode.shape == (1, 120)
+    assert episode["pixels"].shape == (1, 120, 3, 64, 64)
+    # The same actions give the same episode.
+    env = DynmapBatchedEnv(task, 1)
+    td = env.reset(TensorDict({"scene_seed": torch.tensor([session.scene_seed])}, [1]))
+    for t in range(120):
+        assert torch.equal(td["dynamics", "position"], episode["dynamics", "position"][:, t])
+        td = env.step(td.set("action", episode["action"][:, t]))["next"]
+
+
+def test_a_policy_drives_as_in_its_evaluation(actor):
+    session = Session("balance_reaching", actor, seed=3)
+    assert session.driver == "policy"
+    for _ in range(120):
+        session.step()
+    expected = roll_out(actor, "balance_reaching", [scene_seed("validation", 3)])
+    found = session.episode()
+    torch.testing.assert_close(found["dynamics", "position"], expected["dynamics", "position"])
+    predicted = np.stack(session.trace["position", "predicted"])
+    assert np.isnan(predicted[0]).all()
+    reference = expected["predicted_dynamics", "position"][0].numpy()
+    np.testing.assert_allclose(predicted[1:120], reference[1:], atol=1e-5)
+
+
+def test_imagination_goes_on_without_frames(actor):
+    seen, blind = Session("balance_reaching", actor), Session("balance_reaching", actor)
+    for session in (seen, blind):
+        session.driver = "expert"
+        for _ in range(5):
+            session.step()
+    blind.imagining = True
+    blind.td["pixels"] = torch.zeros_like(blind.td["pixels"])  # it does not look
+    latent, (state, _) = blind.states[0], blind.memory
+    blind.step()
+    world_model = actor.world_model
+    with torch.no_grad():
+        predicted, state = world_model.step(
+            latent,
+            blind.td["action"]
+            if "action" in blind.td.keys()
+            else torch.as_tensor(blind.world.action, dtype=torch.float32)[None],
+            state,
+        )
+        expected = world_model.decode_dynamics(predicted, state[0], state[2])["position"][0]
+    np.testing.assert_allclose(blind.prediction["position"], expected.numpy(), atol=1e-5)
+    seen.step()
+    assert not np.allclose(seen.prediction["position"], blind.prediction["position"])
+
+
+def test_the_hand_goes_where_it_points_and_stops_there():
+    session = Session("balance_reaching", seed=1)
+    session.driver = "hand"
+    session.hand.target = (0.6, 0.4)
+    for _ in range(110):
+        session.step()
+    assert np.abs(session.world.position[:2] - (0.6, 0.4)).max() < 0.01
+    assert np.abs(session.world.velocity[:2]).max() < 0.02
+    assert not session.world.dropped, "gently"
+
+
+def test_keys_move_at_the_limit_of_speed():
+    hand, action = Hand(), np.zeros(3)
+    hand.direction = np.array([1.0, 0.0, -1.0])
+    for _ in range(40):
+        action = hand.action(np.zeros(3), action)
+    np.testing.assert_allclose(action, [0.02, 0, -0.05])
+
+
+def test_the_next_scene_begins_anew(actor):
+    session = Session("balance_reaching", actor)
+    first = session.scene_seed
+    for _ in range(3):
+        session.step()
+    session.imagining = True
+    session.restart()
+    assert session.scene_seed == first + 1 and not session.imagining
+    assert (session.world.steps, session.steps, session.prediction, session.drove) == (0, [], {}, set())
+    assert len(session.trace["velocity", "true"]) == 1

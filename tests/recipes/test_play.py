@@ -1,0 +1,116 @@
+"""The play recipe, without a display: what keys and mouse do, what is recorded."""
+
+import pytest
+from commands import run
+from PIL import Image
+
+from dynmap_rl.data import keep_episode, load_dataset, load_meta, publish_episodes
+from dynmap_rl.envs.renderer import pygame
+from dynmap_rl.modules import make_policy, make_world_model, save_policy, save_world_model
+from dynmap_rl.play import PlayWindow, Session, session
+from dynmap_rl.runs import write_json
+
+
+def press(window, *names):
+    for name in names:
+        for kind in (pygame.KEYDOWN, pygame.KEYUP):
+            pygame.event.post(pygame.event.Event(kind, key=pygame.key.key_code(name)))
+    window.handle()
+
+
+@pytest.fixture
+def window():
+    window = PlayWindow(Session("balance_reaching"), size=128)
+    yield window
+    window.close()
+
+
+def test_keys_and_mouse(window):
+    played = window.session
+    press(window, "tab")
+    assert played.driver == "expert"
+    pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=pygame.K_LEFT))
+    window.handle()
+    assert played.driver == "hand" and played.hand.direction.tolist() == [-1, 0, 0]
+    pygame.event.post(pygame.event.Event(pygame.KEYUP, key=pygame.K_LEFT))
+    window.handle()
+    assert played.hand.direction.tolist() == [0, 0, 0]
+    middle = {"pos": (8 + 64, 8 + 20 + 64), "button": 1}
+    pygame.event.post(pygame.event.Event(pygame.MOUSEBUTTONDOWN, middle))
+    window.handle()
+    assert played.hand.target == (0.5, 0.5)
+    pygame.event.post(pygame.event.Event(pygame.MOUSEBUTTONUP, middle))
+    press(window, "space", "b")
+    assert played.hand.target is None and window.paused and window.body == 0
+    first = played.scene_seed
+    press(window, "r", "i", "f5")
+    assert played.scene_seed != first and not played.imagining, "there is no world model"
+    press(window, "escape")
+    assert not window.open
+
+
+def test_the_window_shows_the_scene_and_traces(window):
+    before = window.draw()
+    window.session.driver = "expert"
+    for _ in range(20):
+        window.session.step()
+    after = window.draw()
+    assert after.shape == (window.height, window.width, 3)
+    assert (before != after).any(-1).sum() > 100
+
+
+@pytest.fixture
+def trained(recording, tmp_path):
+    folder, constants = tmp_path / "trained", load_meta(recording)["normalization"]
+    world_model = make_world_model(constants, ("position",), latent_size=16, hidden_size=24)
+    save_world_model(folder / "world_model", world_model)
+    save_policy(folder / "seed_0/policy", make_policy(constants, "recurrent", world_model), world_model)
+    write_json(folder / "config.json", {"task": "bin_dropping"})
+    return folder
+
+
+def test_a_policy_is_watched_and_filmed(trained, tmp_path):
+    result = run(tmp_path, "play", "--policy", trained, "--steps", 6, "--size", 128, "--gif", "film.gif")
+    assert result.returncode == 0, result.stderr
+    with Image.open(tmp_path / "film.gif") as film:
+        assert film.n_frames == 3
+
+
+def test_what_a_person_drove_becomes_a_dataset(tmp_path, monkeypatch):
+    """Here the person does what the expert would."""
+    monkeypatch.setattr(session.Session, "_hand_action", session.Session._expert_action)
+    arguments = "--driver", "hand", "--record", "mine", "--steps", 141 + 120, "--size", 64
+    result = run(tmp_path, "play", *arguments)
+    assert result.returncode == 0, result.stderr
+    assert "kept: 2 episodes in mine.parts" in result.stdout and "2 episodes: mine" in result.stdout
+    assert load_dataset(tmp_path / "mine").shape == (2, 120)
+    meta = load_meta(tmp_path / "mine")
+    assert (meta["kind"], meta["splits"]) == ("human", {"train": [0, 1], "eval": [1, 2]})
+    assert all(row["success"] for row in meta["episodes"])
+
+    played = Session("balance_reaching", seed=7)
+    for _ in range(120):
+        played.step()
+    assert keep_episode(tmp_path / "mine", "balance_reaching", played.episode(), played.scene_seed) == 3
+    publish_episodes(tmp_path / "mine", "balance_reaching")
+    assert load_dataset(tmp_path / "mine", "train").shape == (2, 120)
+    assert not (tmp_path / "mine.parts/old.tmp").exists()
+
+    other = run(tmp_path, "play", "--task", "bin_dropping", "--record", "mine")
+    assert "mine is for human of balance_reaching, not for those of a person in bin_dropping" in other.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--task", "juggling"], "unknown task"),
+        (["--driver", "policy"], "--driver is one of hand, expert, not 'policy'"),
+        (["--policy", "nothing"], "no checkpoint"),
+        (["--expert", "nobody"], "no expert at nobody"),
+    ],
+)
+def test_bad_input_gets_one_clear_line(tmp_path, arguments, message):
+    result = run(tmp_path, "play", *arguments)
+    assert result.returncode == 2
+    assert message in result.stderr and result.stderr.count("\n") == 1
+    assert not any(tmp_path.iterdir())
