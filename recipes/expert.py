@@ -45,7 +45,8 @@ def main(config: Config) -> None:
     from dynmap_rl import runs
     from dynmap_rl.envs import DynmapBatchedEnv
     from dynmap_rl.envs.world import ACCELERATION_LIMIT
-    from dynmap_rl.experts import ExpertNetwork, roll_out
+    from dynmap_rl.evaluation import write_html
+    from dynmap_rl.experts import ExpertNetwork, list_checkpoints, roll_out
     from dynmap_rl.experts.ppo import fresh_scenes, rates, train_ppo
 
     torch.set_num_threads(config.threads)
@@ -66,6 +67,9 @@ def main(config: Config) -> None:
         "hidden": 128,
     }
     train_ppo(env, network, folder, config, judge, facts)
+    last = runs.read_json(folder / "checkpoint" / f"{list_checkpoints(folder / 'checkpoint')[-1]}.json")
+    row = f"success {last['success']:.1%}   drop {last['drop']:.1%}   ({last['episodes']} scenes)"
+    write_html(folder, f"Expert, {env.task.name}", row)
     print(f"done: {folder}")
 
 

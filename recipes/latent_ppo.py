@@ -61,6 +61,7 @@ def main(config: Config) -> None:
     from dynmap_rl import experts, frozen, runs
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.envs.world import ACCELERATION_LIMIT
+    from dynmap_rl.evaluation import write_html
     from dynmap_rl.experts.ppo import fresh_scenes, rates, train_ppo
     from dynmap_rl.training import fingerprint
 
@@ -78,7 +79,7 @@ def main(config: Config) -> None:
     folder = runs.open_run(folder, config, ignore=("run", "iterations", "threads"))
     if (folder / "eval.json").exists():
         print(f"{folder} is done; delete it to run again")
-        return print_result(runs.read_json(folder / "eval.json"))
+        return print(result_text(runs.read_json(folder / "eval.json")))
     torch.set_num_threads(config.threads)
 
     frozen_weights = fingerprint(world_model)
@@ -106,7 +107,8 @@ def main(config: Config) -> None:
         "command": runs.command_line(),
     }
     runs.write_json(folder / "eval.json", result)
-    print_result(result)
+    write_html(folder, f"PPO on latents, {task.name}", result_text(result))
+    print(result_text(result))
 
 
 def make_env(world_model, task: str, num_envs: int):
@@ -135,13 +137,12 @@ def roll_out(network, world_model, task: str, seeds: list[int]) -> list:
     return env.base_env.worlds
 
 
-def print_result(result: dict) -> None:
-    for name in ("latents", "states"):
-        row = result[name]
-        print(
-            f"PPO on {name:8} success {row['success']:6.1%}   drop {row['drop']:6.1%}   "
-            f"position error {1000 * row['position_error']:.0f} mm   ({row['episodes']} scenes)"
-        )
+def result_text(result: dict) -> str:
+    return "\n".join(
+        f"PPO on {name:8} success {row['success']:6.1%}   drop {row['drop']:6.1%}   "
+        f"position error {1000 * row['position_error']:.0f} mm   ({row['episodes']} scenes)"
+        for name, row in ((name, result[name]) for name in ("latents", "states"))
+    )
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import commands
 import numpy as np
 import pytest
 import torch
@@ -139,13 +140,15 @@ def test_the_recipes_take_it_from_the_expert_to_the_row(tmp_path):
     """In the folder that holds the module, in workers too; an expert this short succeeds in nothing."""
 
     def run(recipe, *arguments):
-        command = [sys.executable, str(RECIPES / f"{recipe}.py"), "--task", ABOVE, *arguments]
-        result = subprocess.run(command, cwd=tmp_path, env=os.environ, capture_output=True, text=True)
+        result = commands.run(tmp_path, recipe, "--task", ABOVE, *arguments)
         assert result.returncode == 0, result.stderr
         return result.stdout
 
     episodes = ["--eval_episodes", "2"]
-    run("expert", "--iterations", "1", "--num_envs", "4", "--epochs", "1", "--final_episodes", "2", *episodes)
+    command = [sys.executable, str(RECIPES / "expert.py"), "--task", ABOVE, "--iterations", "1", *episodes]
+    command += ["--num_envs", "4", "--epochs", "1", "--final_episodes", "2"]
+    result = subprocess.run(command, cwd=tmp_path, env=os.environ, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
     expert = ["--expert", "runs/expert/lift/checkpoint"]
     run("evaluate", *expert, "--episodes", "2")
     assert (tmp_path / "runs/evaluate/lift_lift_iteration_001_test.json").exists()

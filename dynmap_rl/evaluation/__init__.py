@@ -1,6 +1,7 @@
 """Closed-loop rollouts, DR / PE / SR, statistics and figures."""
 
 from .held_out import policy_errors, write_held_out
+from .html import write_html
 from .imagination import open_loop_errors
 from .paper import TABLES, paper_numbers, parse_supervision, row_name
 from .report import SHARED_STARTS, evaluate, print_row, write_report
@@ -25,5 +26,6 @@ __all__ = [
     "summarize_seeds",
     "wilson",
     "write_held_out",
+    "write_html",
     "write_report",
 ]

@@ -15,6 +15,7 @@ from dynmap_rl.objectives import imitation_loss
 from dynmap_rl.runs import command_line, write_json
 from dynmap_rl.training import prediction_errors
 
+from .html import write_html
 from .paper import row_name
 
 STATES = ("latent", "hidden1", "hidden2", "goal")
@@ -78,24 +79,24 @@ def write_held_out(
         "results": results,
     }
     write_json(folder / "eval.json", result)
+    write_html(folder, f"{result['row']}, {settings.policy} policy, {dataset}", held_out_text(result))
     return result
 
 
-def print_held_out(result: dict) -> None:
-    """The row of a dataset without a simulator."""
+def held_out_text(result: dict) -> str:
+    """The row of a dataset without a simulator, as lines of text."""
     errors, trained_on = result["held_out"], result["trained_on"]
-    print(f"\n{result['row']}, {result['policy']} policy, {trained_on['dataset']}")
     held_out = len(trained_on["held_out_episodes"])
-    print(
-        f"  held-out errors on {held_out} episodes; without a simulator there is no closed loop, no DR, PE or SR"
-    )
-    print(
-        f"  rgb {errors['rgb']:.4f} (root mean square)   imitation L1 {errors['imitation_l1']:.4f} (normalised)"
-    )
+    lines = [
+        f"{result['row']}, {result['policy']} policy, {trained_on['dataset']}",
+        f"  held-out errors on {held_out} episodes; without a simulator there is no closed loop, no DR, PE or SR",
+        f"  rgb {errors['rgb']:.4f} (root mean square)   imitation L1 {errors['imitation_l1']:.4f} (normalised)",
+    ]
     for quantity, constant in result["spread"].items():
         entries = (f"{n} {error:.3g} ({constant[n]:.3g})" for n, error in errors[quantity].items())
-        print(f"  {quantity:13s} {'   '.join(entries)}")
-    print("  mean absolute errors in the dataset's units, in brackets those of the best constant")
+        lines.append(f"  {quantity:13s} {'   '.join(entries)}")
+    lines.append("  mean absolute errors in the dataset's units, in brackets those of the best constant")
+    return "\n".join(lines)
 
 
 def _spread(episodes: TensorDictBase, quantity: str) -> list[float]:

@@ -1,4 +1,4 @@
-"""What a run leaves behind: ``eval.json``, the table row beside the paper's, figures and an animation."""
+"""What a run leaves behind: ``eval.json``, the table row beside the paper's, figures, an animation, ``report.html``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from dynmap_rl.envs import scene_seed
 from dynmap_rl.modules import Actor, WorldModel, load_policy
 from dynmap_rl.runs import command_line, read_json, write_json
 
-from .held_out import print_held_out, write_held_out
+from .held_out import held_out_text, write_held_out
+from .html import write_html
 from .paper import METRICS, paper_numbers, row_name
 from .rollout import episode_rows, roll_out, scene_seeds
 from .statistics import summarize, summarize_seeds
@@ -102,10 +103,12 @@ def write_report(
         plot_reconstruction(world_model, episodes[:3], folder / "figures" / "reconstruction.png")
     plot_dynamics(world_model, episodes[0], folder / "figures" / "dynamics.png")
     policy = load_policy(folder / f"seed_{seeds[0]}" / "policy")
-    some = [scene_seed("validation", i) for i in range(8)]
+    failed = [row["scene_seed"] for row in test[0] if not row["success"]][:4]
+    some = failed + [scene_seed("validation", i) for i in range(8 - len(failed))]
     rollouts = roll_out(Actor(world_model, policy, mixed=True), settings.task, some, keep_pixels=True)
     save_gif(rollouts, folder / "rollouts.gif")
     write_json(folder / "eval.json", result)
+    write_html(folder, _title(result), row_text(result))
     return result
 
 
@@ -127,16 +130,23 @@ def result_rows(result: dict) -> list[list[dict]]:
 
 def print_row(result: dict) -> None:
     """The table row, beside the paper's."""
+    print(f"\n{row_text(result)}")
+
+
+def row_text(result: dict) -> str:
+    """The same as lines of text."""
     if result["task"] == NO_TASK:
-        return print_held_out(result)
+        return held_out_text(result)
     ours, test, paper = result["paper_protocol"], result["test_protocol"], paper_numbers(result)
     low, high = test["SR_interval"]
-    print(f"\n{_label(result)}, {result['policy']} policy, {result['task']}")
-    print("  paper's protocol  " + _cells({name: ours[name] for name in _metrics(result)}))
-    if paper:
-        print("  paper             " + _cells(paper))
     values = "   ".join(f"{name} {test[name]:.1f} {UNITS[name]}" for name in _metrics(result))
-    print(f"  {test['episodes']} episodes     {values} [{low:.1f}, {high:.1f}]")
+    lines = [
+        _title(result),
+        "  paper's protocol  " + _cells({name: ours[name] for name in _metrics(result)}),
+        *(["  paper             " + _cells(paper)] if paper else []),
+        f"  {test['episodes']} episodes     {values} [{low:.1f}, {high:.1f}]",
+    ]
+    return "\n".join(lines)
 
 
 def markdown_row(result: dict) -> str:
@@ -153,6 +163,10 @@ def row_cells(result: dict) -> tuple[str, str, str]:
     ours = {name: result["paper_protocol"][name] for name in _metrics(result)}
     rate = f"**{result['test_protocol']['SR']:.1f}** [{low:.1f}, {high:.1f}]"
     return _short(paper) if paper else "-", _short(ours), rate
+
+
+def _title(result: dict) -> str:
+    return f"{_label(result)}, {result['policy']} policy, {result['task']}"
 
 
 def _label(result: dict) -> str:

@@ -54,8 +54,7 @@ def test_rows_say_what_happened(rolled):
 
 @pytest.mark.parametrize("task", TASKS)
 def test_both_protocols_on_their_own_scenes(task):
-    actor = make_actor()
-    result = evaluate(actor.world_model, actor.policy, task, test_episodes=3, paper_episodes=2)
+    result = evaluate(make_actor(), task, test_episodes=3, paper_episodes=2)
     first = [result[name]["rows"]["first_scene_seed"] for name in ("test", "paper")]
     counts = [result[name]["summary"]["episodes"] for name in ("test", "paper")]
     assert [len(result[name]["rows"]["success"]) for name in ("test", "paper")] == counts == [3, 2]

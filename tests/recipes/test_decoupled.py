@@ -36,6 +36,8 @@ def test_smoke_run_leaves_everything_behind(smoke):
     for name in ("figures/reconstruction.png", "figures/dynamics.png", "rollouts.gif"):
         assert (run_folder / name).stat().st_size > 1000
     assert not (run_folder / "features").exists()
+    page = (run_folder / "report.html").read_text()
+    assert "SR 89 (0.9) %" in page and page.count('src="data:image/') == 3
 
 
 def test_the_same_command_again_says_that_it_is_done(smoke, monkeypatch, capsys):
