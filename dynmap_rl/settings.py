@@ -11,6 +11,7 @@ from dynmap_rl.data import NO_TASK
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.world import EPISODE_STEPS
 from dynmap_rl.evaluation import SHARED_STARTS, parse_supervision
+from dynmap_rl.loggers import check_logger
 
 # What replaces defaults where a dataset is of no task of ours. The weights of changed actions suppose that actions are
 # changes and begin at rest, the bars a background of one colour.
@@ -21,7 +22,7 @@ def check_settings(settings) -> list[int]:
     """Refuse what cannot run, before anything is written.
 
     Args:
-        settings: with ``task``, ``device``, ``policy``, ``seeds``, ``dataset``, ``split``, ``test_episodes``, ``paper_episodes``
+        settings: with ``task``, ``device``, ``logger``, ``policy``, ``seeds``, ``dataset``, ``split``, ``test_episodes``, ``paper_episodes``
             and, where there are any, ``updates``, ``policy_updates`` and ``window_steps``. Where it has ``camera``,
             ``goal`` and ``supervision`` too, its task may be none.
 
@@ -35,6 +36,7 @@ def check_settings(settings) -> list[int]:
     if not foreign:
         get_task(settings.task)
     runs.choose_device(settings.device)
+    check_logger(settings.logger)
     modules.check_policy(settings.policy)
     try:
         seeds = [int(seed) for seed in settings.seeds.split(",")]

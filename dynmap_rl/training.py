@@ -15,6 +15,7 @@ from tqdm import tqdm
 from dynmap_rl import runs
 from dynmap_rl.data import NO_TASK, add_distractors, augment, compute_features, sample_windows
 from dynmap_rl.envs.tasks import get_task
+from dynmap_rl.loggers import log_metrics
 from dynmap_rl.modules import WorldModel, mixed_precision
 from dynmap_rl.objectives import ImitationLoss, JointLoss, WorldModelLoss
 
@@ -146,7 +147,7 @@ def _fit(
             losses = {name: check_finite(value) for name, value in losses.items()}
             progress.set_postfix({k.removeprefix("loss_"): f"{v:.3f}" for k, v in losses.items()})
         if done % save_every == 0 or done == settings.updates:
-            runs.append_metrics(folder, done, **losses, **held_out())
+            log_metrics(folder, done, settings.logger, **losses, **held_out())
             runs.save_training_state(
                 path,
                 model=model.state_dict(),
@@ -188,7 +189,7 @@ def train_policy(
             with torch.no_grad():
                 validation = plain(held_out)["loss_policy"]
             loss = check_finite(loss)
-            runs.append_metrics(folder, done, loss=loss, held_out_loss=validation)
+            log_metrics(folder, done, settings.logger, loss=loss, held_out_loss=validation)
             progress.set_postfix(loss=f"{loss:.4f}", held_out=f"{validation:.4f}")
 
 

@@ -46,6 +46,8 @@ class Config:
     device: str = "auto"
     # Seeds trained at a time, each on one core.
     threads: int = 2
+    # Metrics to tensorboard, wandb or trackio as well, where it is installed.
+    logger: str | None = None
 
 
 SMOKE = {
@@ -63,7 +65,7 @@ def main(config: Config) -> None:
     seeds = settings.check_settings(config)
     name = f"{config.policy}{'_smoke' if config.smoke else ''}"
     folder = config.run or Path("runs/end_to_end") / get_task(config.task).name / name
-    folder = runs.open_run(folder, config, ignore=("run", "threads", "device"))
+    folder = runs.open_run(folder, config, ignore=("run", "threads", "device", "logger"))
     if (folder / "eval.json").exists():
         print(f"{folder} is done; delete it to run again")
         return print_row(runs.read_json(folder / "eval.json"))

@@ -37,6 +37,8 @@ class Config:
     # Fresh scenes for the last checkpoint.
     final_episodes: int = 1000
     threads: int = 2
+    # Metrics to tensorboard, wandb or trackio as well, where it is installed.
+    logger: str | None = None
 
 
 def main(config: Config) -> None:
@@ -48,11 +50,13 @@ def main(config: Config) -> None:
     from dynmap_rl.evaluation import write_html
     from dynmap_rl.experts import ExpertNetwork, list_checkpoints, roll_out
     from dynmap_rl.experts.ppo import fresh_scenes, rates, train_ppo
+    from dynmap_rl.loggers import check_logger
 
+    check_logger(config.logger)
     torch.set_num_threads(config.threads)
     env = DynmapBatchedEnv(config.task, config.num_envs, control="acceleration")
     folder = runs.open_run(
-        config.run or Path("runs/expert") / env.task.name, config, ignore=("iterations", "threads")
+        config.run or Path("runs/expert") / env.task.name, config, ignore=("iterations", "threads", "logger")
     )
     runs.seed_everything(config.seed)
     network = ExpertNetwork(env.task.state_size, tuple(ACCELERATION_LIMIT))

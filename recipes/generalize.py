@@ -46,6 +46,8 @@ class Config:
     device: str = "auto"
     # Policies trained at a time, each on one core.
     threads: int = 2
+    # Metrics to tensorboard, wandb or trackio as well, where it is installed.
+    logger: str | None = None
 
 
 SMOKE = {
@@ -70,7 +72,7 @@ def main(config: Config) -> None:
     name = f"{source['training']}_{'_'.join(world_model.supervision) or 'none'}_{config.policy}"
     name += "_smoke" if config.smoke else ""
     folder = config.run or Path("runs/generalize") / get_task(config.task).name / name
-    folder = runs.open_run(folder, config, ignore=("run", "threads", "device"))
+    folder = runs.open_run(folder, config, ignore=("run", "threads", "device", "logger"))
     if (folder / "eval.json").exists():
         result = runs.read_json(folder / "eval.json")
         if result["world_model_sha256"] != fingerprint(world_model):

@@ -58,6 +58,8 @@ class Config:
     device: str = "auto"
     # Seeds trained at a time, each on one core.
     threads: int = 2
+    # Metrics to tensorboard, wandb or trackio as well, where it is installed.
+    logger: str | None = None
 
 
 SMOKE = {
@@ -77,7 +79,7 @@ def main(config: Config) -> None:
     seeds = settings.check_settings(config)
     name = f"{'_'.join(supervision) or 'none'}_{config.policy}{'_smoke' if config.smoke else ''}"
     folder = config.run or Path("runs/joint") / settings.name_task(config) / name
-    folder = runs.open_run(folder, config, ignore=("run", "threads", "device"))
+    folder = runs.open_run(folder, config, ignore=("run", "threads", "device", "logger"))
     if (folder / "eval.json").exists():
         print(f"{folder} is done; delete it to run again")
         return print_row(runs.read_json(folder / "eval.json"))

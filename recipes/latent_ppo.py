@@ -47,6 +47,8 @@ class Config:
     # Every stage in a minimal size, for tests.
     smoke: bool = False
     threads: int = 2
+    # Metrics to tensorboard, wandb or trackio as well, where it is installed.
+    logger: str | None = None
 
 
 SMOKE = {
@@ -63,6 +65,7 @@ def main(config: Config) -> None:
     from dynmap_rl.envs.world import ACCELERATION_LIMIT
     from dynmap_rl.evaluation import write_html
     from dynmap_rl.experts.ppo import fresh_scenes, rates, train_ppo
+    from dynmap_rl.loggers import check_logger
     from dynmap_rl.training import fingerprint
 
     if config.smoke:
@@ -71,12 +74,13 @@ def main(config: Config) -> None:
         raise ValueError(
             "--world_model is the run folder of a world model; train one with recipes/decoupled.py"
         )
+    check_logger(config.logger)
     task = get_task(config.task)
     world_model, source = frozen.load_source(config.world_model)
     world_model.requires_grad_(False)
     expert = experts.load_expert(config.expert or config.task)
     folder = config.run or Path("runs/latent_ppo") / f"{task.name}{'_smoke' if config.smoke else ''}"
-    folder = runs.open_run(folder, config, ignore=("run", "iterations", "threads"))
+    folder = runs.open_run(folder, config, ignore=("run", "iterations", "threads", "logger"))
     if (folder / "eval.json").exists():
         print(f"{folder} is done; delete it to run again")
         return print(result_text(runs.read_json(folder / "eval.json")))

@@ -13,6 +13,7 @@ from dynmap_rl.training import make_optimizer, step, train_policy, train_world_m
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 SETTINGS = SimpleNamespace(
+    logger=None,
     updates=4, windows=2, window_steps=6, rgb_steps=2, distractors=3, learning_rate=1e-3, beta_z=0.1,
     beta_dynamics=1.0, world_model_seed=0, policy_updates=4, policy_batch=2, policy_learning_rate=1e-3, emphasis=60.0,
 )  # fmt: skip

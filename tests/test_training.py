@@ -16,6 +16,7 @@ CONSTANTS = {
     "position": {"low": [0.0] * 6, "high": [1.0] * 6},
 }
 SETTINGS = SimpleNamespace(
+    logger=None,
     updates=6,
     windows=2,
     window_steps=5,

@@ -19,6 +19,7 @@ from dynmap_rl import runs
 from dynmap_rl.envs import scene_seed
 from dynmap_rl.envs.tasks import BalanceReaching
 from dynmap_rl.envs.world import EPISODE_STEPS, World
+from dynmap_rl.loggers import log_metrics
 
 from .policy import ExpertNetwork, make_actor
 
@@ -96,7 +97,7 @@ def train_ppo(
             "drop": batch["next", "dropped"].squeeze(-1)[done].float().mean(),
             **losses,
         }
-        runs.append_metrics(folder, iteration + 1, **metrics)
+        log_metrics(folder, iteration + 1, settings.logger, **metrics)
         progress.set_postfix(success=f"{metrics['success']:.2f}", drop=f"{metrics['drop']:.2f}")
         last = iteration + 1 == settings.iterations
         if last or (iteration + 1) % settings.checkpoint_every == 0:
