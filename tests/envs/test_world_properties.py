@@ -1,0 +1,109 @@
+"""Laws that hold in every scene and under any action: 90 random episodes of 120 steps, 10,800 in all, for each task."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dynmap_rl.envs.tasks import TASKS, get_task
+from dynmap_rl.envs.world import (
+    ACCELERATION_LIMIT,
+    ACTION_LIMIT,
+    CONTROL_DT,
+    GRAVITY,
+    VELOCITY_LIMIT,
+    WORKSPACE_HIGH,
+    WORKSPACE_LOW,
+    World,
+)
+
+every_task = pytest.mark.parametrize("name", TASKS)
+episodes = given(seed=st.integers(0, 2**32 - 1), wildness=st.floats(0.05, 4))
+many = settings(max_examples=90, deadline=None, derandomize=True)
+
+DEPTH = 0.01  # m, for a moment, when something is hit at full speed
+EDGE = ACCELERATION_LIMIT * CONTROL_DT**2 / 8 + 1e-6  # the last braking step need not be a whole one
+
+
+def make_world(name: str, seed: int) -> tuple[World, np.random.Generator]:
+    rng = np.random.default_rng(seed)
+    return get_task(name).make_world(get_task(name).sample_scene(rng)), rng
+
+
+def wild(rng: np.random.Generator, wildness: float) -> np.ndarray:
+    return wildness * ACTION_LIMIT * rng.standard_normal(3)
+
+
+@every_task
+@many
+@episodes
+def test_all_is_finite_and_the_cart_within_its_limits(name, seed, wildness):
+    world, rng = make_world(name, seed)
+    for _ in range(120):
+        world.step(wild(rng, wildness))
+        assert np.isfinite([world.position, world.velocity, world.acceleration]).all()
+        assert (np.abs(world.velocity[:3]) <= VELOCITY_LIMIT + 1e-6).all()
+        assert (world.position[:3] >= WORKSPACE_LOW - EDGE).all()
+        assert (world.position[:3] <= WORKSPACE_HIGH + EDGE).all()
+
+
+@every_task
+@many
+@episodes
+def test_the_block_does_not_sink_into_what_it_touches(name, seed, wildness):
+    """But where the cart, which nothing stops, presses it against something else."""
+    world, rng = make_world(name, seed)
+    [block] = world.block.shapes
+    depths = []
+    for _ in range(120):
+        world.step(wild(rng, wildness))
+        touched = world.space.shape_query(block)
+        if len({info.shape for info in touched}) == 1:
+            depths += [-point.distance for info in touched for point in info.contact_point_set.points]
+    assert max(depths, default=0) < DEPTH
+    assert np.median(depths) < 3 * world.space.collision_slop
+
+
+@every_task
+@many
+@episodes
+def test_what_has_come_to_rest_stays_at_rest(name, seed, wildness):
+    """Standing or fallen: its energy does not rise again."""
+    world, rng = make_world(name, seed)
+    for _ in range(30):
+        world.step(wild(rng, wildness))
+    for _ in range(400):
+        before = world.position
+        world.step(np.zeros(3))
+        # The solver lifts what sank in out again without a velocity.
+        if max(np.abs(world.velocity).max(), np.abs(world.position - before).max()) < 1e-6:
+            break
+    else:
+        raise AssertionError("it never comes to rest")
+    heights = []
+    for _ in range(60):
+        world.step(np.zeros(3))
+        speed, turn = np.hypot(*world.velocity[3:5]), world.velocity[5]
+        kinetic = speed**2 / 2 + world.block.moment / world.block.mass * turn**2 / 2
+        heights.append(world.position[4] + kinetic / GRAVITY)  # that all the energy would lift the block to
+    assert max(heights) < heights[0] + 1e-5
+
+
+@many
+@given(seed=st.integers(0, 2**32 - 1), wildness=st.floats(0.02, 0.15))
+def test_the_mirrored_world_moves_mirrored(seed, wildness):
+    """As long as the block stands: what tips is chaotic."""
+    world, rng = make_world("balance_reaching", seed)
+    scene = world.scene
+    mirrored = World(
+        scene.replace(cart_x=1 - scene.cart_x, goal_x=1 - scene.goal_x, block_shift=-scene.block_shift)
+    )
+    mirror = np.array([-1, 1, -1])
+    for _ in range(60):
+        action = wild(rng, wildness)
+        world.step(action)
+        mirrored.step(action * mirror)
+        if world.dropped or abs(world.block_in_cart[2]) > 0.002:
+            break
+        expected = world.position * np.tile(mirror, 2) + [1, 0, 0, 1, 0, 0]
+        np.testing.assert_allclose(mirrored.position, expected, atol=2e-3)
