@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     import torch
 
 
+LOCKS = {}  # of the folders of this process, held until it ends
+
+
 def write_json(path: Path, value) -> None:
     """Write ``value`` under a temporary name, then rename: the file is whole or absent."""
     path = Path(path)
@@ -46,14 +49,17 @@ def read_json(path: Path):
 
 
 def open_run(folder: Path, config, *, ignore: tuple[str, ...] = ()) -> Path:
-    """Create the folder, or reopen it where its settings are the same ones (but for ``ignore``).
+    """Create the folder, or reopen it where its settings are the same ones (but for ``ignore``); it is then this
+    process's until it ends.
 
     Args:
         config: a dataclass of settings.
 
     Raises:
-        ValueError: the folder holds a run with other settings.
+        ValueError: the folder holds a run with other settings, or another process works in it.
     """
+    from filelock import FileLock, Timeout
+
     folder = Path(folder)
     settings = json.loads(json.dumps(dataclasses.asdict(config), default=str))
     path = folder / "config.json"
@@ -71,6 +77,11 @@ def open_run(folder: Path, config, *, ignore: tuple[str, ...] = ()) -> Path:
             )
     else:
         write_json(path, settings)
+    try:
+        LOCKS[folder.resolve()] = FileLock(folder.resolve() / ".lock", timeout=0, is_singleton=True)
+        LOCKS[folder.resolve()].acquire()
+    except Timeout as error:
+        raise ValueError(f"{folder} is being run by another process; wait for it, or stop it") from error
     return folder
 
 

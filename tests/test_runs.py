@@ -1,5 +1,7 @@
 """Run folders: nothing is lost by a kill, nothing damaged is read in silence."""
 
+import subprocess
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -45,6 +47,22 @@ def test_run_reopens_with_the_same_settings_only(tmp_path):
     runs.open_run(tmp_path / "run", replace(settings, steps=6), ignore=("steps",))
     with pytest.raises(ValueError, match=r"rate: 0\.1 there, 0\.2 here"):
         runs.open_run(tmp_path / "run", replace(settings, rate=0.2), ignore=("steps",))
+
+
+def test_a_run_belongs_to_one_process(tmp_path):
+    code = (
+        "import sys; sys.path[:0] = sys.argv[2:]\n"
+        "from pathlib import Path; from dynmap_rl import runs; from test_runs import Settings\n"
+        "runs.open_run(Path(sys.argv[1]), Settings()); print('open', flush=True); sys.stdin.read()"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path / "run"), str(Path(__file__).parent)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout.readline() == "open\n"
+        with pytest.raises(ValueError, match="is being run by another process; wait for it, or stop it"):
+            runs.open_run(tmp_path / "run", Settings())
+        other.kill()
+    runs.open_run(tmp_path / "run", Settings())
+    runs.open_run(tmp_path / "run", Settings())
 
 
 def test_metrics_round_trip(tmp_path):
