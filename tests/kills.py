@@ -1,0 +1,112 @@
+"""Kill recipes at random moments, run the same command again, and compare with a run that nobody killed.
+
+    uv run python tests/kills.py              # 20 kills of each of collect, expert, decoupled, tables
+    uv run python tests/kills.py expert -n 5
+
+Every process of the recipe gets SIGKILL. What must be the same: every number of a dataset and its metadata, every
+weight, every metric but the wall-clock time, every row of every cell. Ends with an error where anything differs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from safetensors.torch import load_file
+
+RECIPES = Path(__file__).parents[1] / "recipes"
+SMALL = "--num_envs 4 --iterations 12 --epochs 1 --minibatch 240 --checkpoint_every 2 --eval_episodes 4 --final_episodes 4"
+COMMANDS = {
+    "collect": "--episodes 60 --eval_episodes 10",
+    "expert": SMALL,
+    "decoupled": "--smoke --seeds 0,1",
+    "tables": "--smoke --only joint_none --results results",
+}
+LEFT_OUT = {"seconds", "command"}  # wall-clock time
+
+
+def run(recipe: str, folder: Path, kill_after: float | None = None) -> bool:
+    """Whether the recipe came to its end."""
+    command = [sys.executable, str(RECIPES / f"{recipe}.py"), *COMMANDS[recipe].split()]
+    environment = {**os.environ, "TQDM_DISABLE": "1"}
+    with open(folder.parent / f"{folder.name}.log", "a") as log:
+        process = subprocess.Popen(
+            command, cwd=folder, env=environment, stdout=log, stderr=log, start_new_session=True
+        )
+        try:
+            code = process.wait(kill_after)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            return False
+    if code:
+        raise SystemExit(f"{recipe} failed; see {log.name}")
+    return True
+
+
+def contents(folder: Path) -> dict[str, object]:
+    """What must be the same, by its path."""
+    found = {}
+    for path in sorted(folder.rglob("*")):
+        name = str(path.relative_to(folder))
+        if path.suffix == ".safetensors":
+            found[name] = {key: value.numpy().tobytes() for key, value in load_file(path).items()}
+        elif path.name == "metrics.jsonl":
+            found[name] = [plain(json.loads(line)) for line in path.read_text().splitlines()]
+        elif (
+            path.name in ("eval.json", "dynmap.json", "info.json", "stats.json")
+            or path.parent.name == "results"
+        ):
+            found[name] = plain(json.loads(path.read_text()))
+        elif path.suffix == ".parquet" and "data" in path.parts:
+            found[name] = path.read_bytes()
+    return found
+
+
+def plain(value):
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items() if key not in LEFT_OUT}
+    return [plain(item) for item in value] if isinstance(value, list) else value
+
+
+def torment(recipe: str, kills: int, folder: Path) -> None:
+    whole = folder / f"{recipe}_whole"
+    whole.mkdir()
+    began = time.perf_counter()
+    run(recipe, whole)
+    duration = time.perf_counter() - began
+    expected, count, runs = contents(whole), 0, 0
+    while count < kills:
+        killed, runs = folder / f"{recipe}_killed_{runs}", runs + 1
+        killed.mkdir()
+        while not run(recipe, killed, random.uniform(0, duration) if count < kills else None):
+            count += 1
+        found = contents(killed)
+        differing = sorted(name for name in {*expected, *found} if expected.get(name) != found.get(name))
+        if differing:
+            raise SystemExit(f"{recipe}: after {count} kills these differ: {', '.join(differing)}")
+    print(f"{recipe}: {count} kills of {runs} runs, {len(expected)} files the same", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("recipes", nargs="*", default=list(COMMANDS))
+    parser.add_argument("-n", "--kills", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    random.seed(arguments.seed)
+    with tempfile.TemporaryDirectory() as folder:
+        for recipe in arguments.recipes:
+            torment(recipe, arguments.kills, Path(folder))
+
+
+if __name__ == "__main__":
+    main()
