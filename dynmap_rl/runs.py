@@ -61,6 +61,12 @@ def open_run(folder: Path, config, *, ignore: tuple[str, ...] = ()) -> Path:
     from filelock import FileLock, Timeout
 
     folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        LOCKS[folder.resolve()] = FileLock(folder.resolve() / ".lock", timeout=0, is_singleton=True)
+        LOCKS[folder.resolve()].acquire()
+    except Timeout as error:
+        raise ValueError(f"{folder} is being run by another process; wait for it, or stop it") from error
     settings = json.loads(json.dumps(dataclasses.asdict(config), default=str))
     path = folder / "config.json"
     if path.exists():
@@ -77,11 +83,6 @@ def open_run(folder: Path, config, *, ignore: tuple[str, ...] = ()) -> Path:
             )
     else:
         write_json(path, settings)
-    try:
-        LOCKS[folder.resolve()] = FileLock(folder.resolve() / ".lock", timeout=0, is_singleton=True)
-        LOCKS[folder.resolve()].acquire()
-    except Timeout as error:
-        raise ValueError(f"{folder} is being run by another process; wait for it, or stop it") from error
     return folder
 
 

@@ -53,34 +53,38 @@ def main(config: Config) -> None:
 
 def judge_policy(config: Config) -> tuple[str, dict]:
     """The name of the result, and the result: ``DR``, ``PE``, ``SR`` and what became of every episode."""
+    from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.evaluation import evaluate
     from dynmap_rl.modules import find_run, load_actor
     from dynmap_rl.runs import read_json
 
-    folder, settings = find_run(config.policy), {}
-    if (folder / f"seed_{config.seed}").exists():
-        actor, settings = load_actor(folder, config.seed), read_json(folder / "config.json")
-    else:
-        actor = load_lerobot(config)
+    folder = find_run(config.policy)
+    facts = folder / "config.json"
+    settings = read_json(facts) if facts.exists() else {}
     task = config.task or settings.get("task", "balance_reaching")
+    description = get_task(task).description
+    if (folder / "world_model").exists() or any(folder.glob("seed_*")):
+        actor = load_actor(folder, config.seed)
+    else:
+        actor = load_lerobot(config.policy, description)
     result = evaluate(actor, task, config.episodes, 0, config.split)["test"]
     summary = result["summary"]
     low, high = summary["SR_interval"]
     print(
         f"DR {summary['DR']:.1f} %   PE {summary['PE']:.1f} mm   SR {summary['SR']:.1f} % [{low:.1f}, {high:.1f}]"
     )
-    return f"{task}_{folder.name}_seed_{config.seed}", {"task": task, "policy": config.policy, **result}
+    name = "_".join([get_task(task).name, *Path(config.policy).parts[-4:], f"seed_{config.seed}"])
+    return name.replace("/", ""), {"task": task, "policy": config.policy, **result}
 
 
-def load_lerobot(config: Config):
+def load_lerobot(policy: str, instruction: str):
     try:
         from dynmap_rl.integrations.lerobot import LeRobotActor
     except ImportError as error:
         raise ValueError(
-            f"{config.policy} is no run of ours with a seed {config.seed}; for a policy of LeRobot install "
-            f"'dynmap_rl[lerobot]' ({error})"
+            f"{policy} is no run of ours; for a policy of LeRobot install 'dynmap_rl[lerobot]' ({error})"
         ) from error
-    return LeRobotActor(config.policy)
+    return LeRobotActor(policy, instruction=instruction)
 
 
 def judge_expert(config: Config) -> tuple[str, dict]:
@@ -97,6 +101,10 @@ def judge_expert(config: Config) -> tuple[str, dict]:
     checkpoint = config.checkpoint or list_checkpoints(expert)[-1]
     network = load_expert(expert, checkpoint)
     trained_on = get_task(read_json(find_expert(expert) / f"{checkpoint}.json")["task"])
+    if not issubclass(task.ranges.scene, trained_on.ranges.scene):
+        raise ValueError(
+            f"the expert {expert} sees states of {trained_on.name}, which {task.name} does not have"
+        )
     worlds = roll_out(network, task, scene_seeds(config.split, config.episodes), states=trained_on)
     outcomes = {
         "success": [task.is_success(world) for world in worlds],

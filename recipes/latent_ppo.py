@@ -110,8 +110,8 @@ def main(config: Config) -> None:
         "states": states | {"expert": config.expert or config.task},
         "command": runs.command_line(),
     }
+    write_html(folder, f"PPO on latents, {task.name}", result_text(result), result["command"])
     runs.write_json(folder / "eval.json", result)
-    write_html(folder, f"PPO on latents, {task.name}", result_text(result))
     print(result_text(result))
 
 

@@ -52,19 +52,27 @@ def main(config: Config) -> None:
     from dynmap_rl.runs import read_json
 
     actor = load_actor(config.policy, config.seed) if config.policy else None
-    trained_on = read_json(find_run(config.policy) / "config.json").get("task") if config.policy else None
+    facts = find_run(config.policy) / "config.json" if config.policy else None
+    trained_on = read_json(facts).get("task") if facts and facts.exists() else None
     task = config.task or trained_on or "balance_reaching"
     get_task(task)
+    if config.size < 64 or (config.steps is not None and config.steps < 1):
+        raise ValueError("--size must be at least 64 and --steps at least 1")
+    if config.gif and not config.steps:
+        raise ValueError("--gif needs --steps, the number of steps that the film shows")
+    scene = config.scene
     if config.record:
         open_folder(config.record, task)
-    session = Session(task, actor, config.expert, config.scene)
+        scene += len(list_shards(config.record, task))
+    # Demonstrations are of scenes for training, and every session begins with new ones.
+    session = Session(task, actor, config.expert, scene, split="train" if config.record else "validation")
     if config.driver:
         if config.driver not in session.drivers:
             raise ValueError(f"--driver is one of {', '.join(session.drivers)}, not {config.driver!r}")
         session.driver = config.driver
     window, frames = PlayWindow(session, config.size), []
     try:
-        play(config, session, window, frames, CONTROL_DT)
+        play(config, task, session, window, frames, CONTROL_DT)
     finally:
         window.close()
         if config.record and (count := len(list_shards(config.record, task))) > 1:
@@ -73,7 +81,7 @@ def main(config: Config) -> None:
         save_film(frames, config.gif)
 
 
-def play(config: Config, session, window, frames: list, dt: float) -> None:
+def play(config: Config, task: str, session, window, frames: list, dt: float) -> None:
     """Until the window is closed, or for a number of steps."""
     from dynmap_rl.data import keep_episode
     from dynmap_rl.envs.renderer import pygame
@@ -95,7 +103,7 @@ def play(config: Config, session, window, frames: list, dt: float) -> None:
             and session.drove == {"hand"}
             and session.succeeded
         ):
-            count = keep_episode(config.record, session.env.task.name, session.episode(), session.scene_seed)
+            count = keep_episode(config.record, task, session.episode(), session.scene_seed)
             print(f"kept: {count} episodes in {config.record}.parts", flush=True)
         waited = waited + 1 if session.over and not window.paused else 0
         if waited > 1 / dt:  # a second to see how it ended

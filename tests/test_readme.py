@@ -176,3 +176,9 @@ def test_the_shipped_policy_is_that_of_the_results():
     low, high = facts["summary"]["SR_interval"]
     rate, error = facts["summary"]["SR"], facts["summary"]["PE"]
     assert f"[SR {rate:.1f} % [{low:.1f}, {high:.1f}], PE {error:.1f} mm]" in README
+
+
+def test_the_baseline_is_that_of_the_results():
+    summary = json.loads((ROOT / "recipes/results/act_balance_reaching.json").read_text())["summary"]
+    low, high = summary["SR_interval"]
+    assert f"[SR {summary['SR']:.1f} % [{low:.1f}, {high:.1f}], PE {summary['PE']:.1f} mm]" in README

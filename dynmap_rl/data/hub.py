@@ -89,6 +89,7 @@ def _describe(meta: dict, instruction: str) -> str:
     splits, task, kind = meta["splits"], meta["task"], meta["kind"]
     train, test = (end - first for first, end in (splits["train"], splits["eval"]))
     collect = f"collect.py --task {task} --kind {kind} --episodes {train} --eval_episodes {test}"
+    collect += f" --expert {meta['expert']}" if meta["expert"] != task else ""
     maker, command = {
         "demonstrations": (
             "state-based PPO experts act; successful episodes, most with short pushes",

@@ -6,10 +6,11 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+from filelock import FileLock, Timeout
 from tensordict import TensorDict
 
 from dynmap_rl.envs.tasks import get_task
-from dynmap_rl.runs import read_json, write_json
+from dynmap_rl.runs import LOCKS, read_json, write_json
 
 from .demonstrations import Plan
 from .loading import META, load_meta
@@ -30,7 +31,8 @@ def keep_episode(root: str | Path, task: str, episode: TensorDict, scene_seed: i
         OSError: the disk does not hold the episode.
     """
     open_folder(root, task)
-    number = len(list_shards(root, task))
+    shards = list_shards(root, task)
+    number = 1 + max((int(shard.folder.name) for shard in shards), default=-1)
     folder = _parts(root) / f"{number:04d}"
     temporary = folder.with_name(f"{folder.name}.tmp")
     shutil.rmtree(temporary, ignore_errors=True)  # of a killed process
@@ -38,7 +40,7 @@ def keep_episode(root: str | Path, task: str, episode: TensorDict, scene_seed: i
     plan = Plan(scene_seed, checkpoint=KIND)
     write_json(temporary / ROWS, [describe_episode(task, plan, episode[0])])
     temporary.replace(folder)
-    return number + 1
+    return len(shards) + 1
 
 
 def publish_episodes(root: str | Path, task: str) -> Path:
@@ -56,15 +58,16 @@ def publish_episodes(root: str | Path, task: str) -> Path:
         )
     train = len(shards) - max(1, len(shards) // 10)
     shards = shards[:train] + [replace(shard, split="eval") for shard in shards[train:]]
-    merged, old = _parts(root) / "merged.tmp", _parts(root) / "old.tmp"
-    for leftover in (merged, old):
+    temporary = merged, old, _ = [_parts(root) / f"{name}.tmp" for name in ("merged", "old", "cache")]
+    for leftover in temporary:
         shutil.rmtree(leftover, ignore_errors=True)
     settings = {"format": FORMAT, "task": task, "expert": KIND, "kind": KIND, "episodes": train}
     merge_shards(shards, merged, settings)
     if root.exists():
         root.replace(old)
     merged.replace(root)
-    shutil.rmtree(old, ignore_errors=True)
+    for leftover in temporary:
+        shutil.rmtree(leftover, ignore_errors=True)
     return root
 
 
@@ -82,12 +85,22 @@ def open_folder(root: str | Path, task: str) -> None:
         raise ValueError(f"{root} exists and is no dataset of ours; choose another folder")
     elif path.exists():
         stored = read_json(path)
+    if (root / META).exists() and len(list_shards(root, task)) < (there := len(stored["episodes"])):
+        raise ValueError(
+            f"{root} has {there} episodes, but {_parts(root)} no longer holds them all, to be merged with new ones; "
+            "choose another folder"
+        )
     if any(stored.get(name) != value for name, value in settings.items()):
         raise ValueError(
             f"{root} is for {stored.get('kind')} of {stored.get('task')}, not for those of a person in {task}; "
             "choose another folder"
         )
     write_json(path, settings)
+    try:
+        LOCKS[path] = FileLock(path.with_name(".lock"), timeout=0, is_singleton=True)
+        LOCKS[path].acquire()
+    except Timeout as error:
+        raise ValueError(f"{root} is being recorded to by another process; end it first") from error
 
 
 def list_shards(root: str | Path, task: str) -> list[Shard]:

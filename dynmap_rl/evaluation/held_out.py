@@ -78,8 +78,9 @@ def write_held_out(
         "command": command_line(),
         "results": results,
     }
-    write_json(folder / "eval.json", result)
-    write_html(folder, f"{result['row']}, {settings.policy} policy, {dataset}", held_out_text(result))
+    title = f"{result['row']}, {settings.policy} policy, {dataset}"
+    write_html(folder, title, held_out_text(result), result["command"])
+    write_json(folder / "eval.json", result)  # last: it says that all is done
     return result
 
 

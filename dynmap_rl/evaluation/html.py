@@ -22,14 +22,15 @@ PICTURES = {  # in this order
 }
 
 
-def write_html(folder: Path, title: str, row: str) -> Path:
+def write_html(folder: Path, title: str, row: str, command: str = "") -> Path:
     """Write ``report.html``: the table row, animations and figures, curves, settings, the command.
 
     Args:
-        folder: of a run, with ``config.json`` and whatever of ``metrics.jsonl``, ``seed_N/metrics.jsonl``, figures
-            and ``eval.json`` there is.
+        folder: of a run, with ``config.json`` and whatever of ``metrics.jsonl``, ``seed_N/metrics.jsonl`` and
+            figures there is.
         title: of the page.
         row: the result, as text.
+        command: that made it.
     """
     parts = [f"<h1>{html.escape(title)}</h1>", f"<pre>{html.escape(row.strip())}</pre>"]
     for name, caption in PICTURES.items():
@@ -48,8 +49,7 @@ def write_html(folder: Path, title: str, row: str) -> Path:
         for name, value in settings.items()
     )
     parts += ["<h2>Settings</h2>", f"<table>{cells}</table>"]
-    if (folder / "eval.json").exists():
-        parts.append(f"<pre>{html.escape(read_json(folder / 'eval.json')['command'])}</pre>")
+    parts += [f"<pre>{html.escape(command)}</pre>"] if command else []
     page = (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>'
         f"<style>{STYLE}</style></head><body>{''.join(parts)}</body></html>\n"

@@ -34,6 +34,8 @@ def open_loop_errors(
     """
     if "position" not in world_model.supervision:
         raise ValueError("the world model is not supervised on position: there is nothing to compare")
+    if horizon < 1:
+        raise ValueError(f"a horizon is at least one step, not {horizon}")
     if context < 1 or context + horizon > episodes.shape[1]:
         steps = episodes.shape[1]
         raise ValueError(f"{context} + {horizon} steps do not fit into episodes of {steps}")

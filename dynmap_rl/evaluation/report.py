@@ -107,8 +107,8 @@ def write_report(
     some = failed + [scene_seed("validation", i) for i in range(8 - len(failed))]
     rollouts = roll_out(Actor(world_model, policy, mixed=True), settings.task, some, keep_pixels=True)
     save_gif(rollouts, folder / "rollouts.gif")
-    write_json(folder / "eval.json", result)
-    write_html(folder, _title(result), row_text(result))
+    write_html(folder, _title(result), row_text(result), result["command"])
+    write_json(folder / "eval.json", result)  # last: it says that all is done
     return result
 
 

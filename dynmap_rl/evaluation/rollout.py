@@ -37,6 +37,8 @@ def roll_out(
         these rollouts (zeros at t = 0).
     """
     actor = actor.eval()
+    if hasattr(actor, "reset"):  # of LeRobot's policies, whose memory is their own
+        actor.reset()
     device = next(actor.parameters()).device
     env = DynmapBatchedEnv(task, len(seeds), from_pixels=True, pixels_only=True, device=device)
     td = env.reset(TensorDict({"scene_seed": torch.tensor(seeds)}, [len(seeds)]))

@@ -111,7 +111,7 @@ def load_actor(run: str | Path, seed: int = 0) -> Actor:
 def find_run(run: str | Path) -> Path:
     """The folder of a run that ships with the package, by its name, or else the path itself."""
     shipped = SHIPPED / run
-    return shipped if shipped.is_dir() else Path(run)
+    return shipped if (shipped / "config.json").exists() else Path(run)
 
 
 def _read_arguments(folder: Path) -> dict:

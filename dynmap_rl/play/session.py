@@ -11,9 +11,11 @@ from tensordict import TensorDict
 
 from dynmap_rl.data.demonstrations import KEYS
 from dynmap_rl.envs import DynmapBatchedEnv, scene_seed
+from dynmap_rl.envs.tasks import BalanceReaching, get_task
 from dynmap_rl.envs.world import ACTION_LIMIT, CONTROL_DT, EPISODE_STEPS
-from dynmap_rl.experts import load_expert
+from dynmap_rl.experts import find_expert, list_checkpoints, load_expert
 from dynmap_rl.modules import DYNAMICS, Actor
+from dynmap_rl.runs import read_json
 
 DRIVERS = "hand", "expert", "policy"
 HAND_ACCELERATION = np.array([1.5, 1.5, 4.0])  # m/s^2, m/s^2, rad/s^2: at the cart's limit a tall block tips
@@ -52,7 +54,8 @@ class Session:
         task: its name.
         actor: world model and policy; without it nothing is predicted and no policy drives.
         expert: of the task; by default the one that ships with the package, None where there is none.
-        seed: of the first scene, in the split ``validation``.
+        seed: number of the first scene.
+        split: that scenes are of.
 
     Attributes:
         driver: one of ``hand``, ``expert``, ``policy``.
@@ -66,16 +69,16 @@ class Session:
     """
 
     def __init__(
-        self, task: str, actor: Actor | None = None, expert: str | Path | None = None, seed: int = 0
+        self,
+        task: str,
+        actor: Actor | None = None,
+        expert: str | Path | None = None,
+        seed: int = 0,
+        split: str = "validation",
     ):
         self.env = DynmapBatchedEnv(task, 1, from_pixels=True)
-        self.actor, self.seed = actor, seed
-        try:
-            self.expert = load_expert(expert or task)
-        except ValueError:
-            if expert:
-                raise
-            self.expert = None
+        self.actor, self.seed, self.split = actor, seed, split
+        self.expert, self.expert_task = _find_expert(self.env.task, expert or task, named=expert is not None)
         self.driver, self.hand = "policy" if actor else "hand", Hand()
         self.restart(seed)
 
@@ -100,7 +103,7 @@ class Session:
     def restart(self, seed: int | None = None) -> None:
         """A new episode, of the next scene where none is named."""
         self.seed = self.seed + 1 if seed is None else seed
-        seeds = torch.tensor([scene_seed("validation", self.seed)])
+        seeds = torch.tensor([scene_seed(self.split, self.seed)])
         self.td = self.env.reset(TensorDict({"scene_seed": seeds}, [1]))
         self.scene_seed, self.imagining = int(seeds), False
         self.drove: set[str] = set()
@@ -120,12 +123,12 @@ class Session:
         self.drove.add(self.driver)
         policy_action, latent = self._look() if self.actor else (None, None)
         action = {"hand": self._hand_action, "expert": self._expert_action, "policy": lambda: policy_action}
-        td = self.env.step(self.td.set("action", self._as_tensor(action[self.driver]())))
-        executed = self._as_tensor(self.world.action)
-        td["action"] = executed
-        self.steps.append(td.select(*KEYS).clone())
+        wanted = self._as_tensor(action[self.driver]())
+        td = self.env.step(self.td.set("action", wanted))
         if self.actor:
-            self._predict(latent, executed)
+            self._predict(latent, wanted)  # as in an evaluation: before the cart's limits
+        td["action"] = self._as_tensor(self.world.action)
+        self.steps.append(td.select(*KEYS).clone())
         self.td = td["next"]
         self._note()
 
@@ -137,8 +140,8 @@ class Session:
         return self.hand.action(self.world.commanded, self.world.action)
 
     def _expert_action(self) -> torch.Tensor:
-        mean, _ = self.expert(self.td["state"])
-        return self.world.action_for(mean[0].numpy())
+        state = torch.from_numpy(self.expert_task.state(self.world))
+        return self.world.action_for(self.expert(state)[0].numpy())
 
     def _as_tensor(self, action) -> torch.Tensor:
         return torch.as_tensor(np.asarray(action), dtype=torch.float32).reshape(1, 3)
@@ -166,3 +169,17 @@ class Session:
         for quantity in DYNAMICS:
             self.trace[quantity, "true"].append(self.td["dynamics", quantity][0].numpy())
             self.trace[quantity, "predicted"].append(self.prediction.get(quantity, np.full(6, np.nan)))
+
+
+def _find_expert(task: BalanceReaching, name: str | Path, named: bool):
+    """The expert of that name and the task whose state it sees; twice None where nobody named it and there is none."""
+    try:
+        expert = load_expert(name)
+    except ValueError:
+        if named:
+            raise
+        return None, None
+    sees = get_task(read_json(find_expert(name) / f"{list_checkpoints(name)[-1]}.json")["task"])
+    if not issubclass(task.ranges.scene, sees.ranges.scene):
+        raise ValueError(f"the expert {name} sees states of {sees.name}, which {task.name} does not have")
+    return expert, sees

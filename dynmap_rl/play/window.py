@@ -33,17 +33,27 @@ class PlayWindow:
     Args:
         session: what is played.
         size: side of the scene, in pixels.
+
+    Raises:
+        ValueError: there is no display.
     """
 
     def __init__(self, session: Session, size: int = 384):
         self.session, self.size = session, size
         self.body, self.paused, self.open = 3, False, True
         self.held: set[str] = set()
-        pygame.display.init(), pygame.font.init()
-        pygame.display.set_caption("dynmap_rl")
+        pygame.font.init()
         self.width = 2 * size + 3 * MARGIN
         self.height = size + 3 * MARGIN + 3 * LINE + len(DYNAMICS) * TRACE
-        self.screen = pygame.display.set_mode((self.width, self.height))
+        try:
+            pygame.display.init()
+            self.screen = pygame.display.set_mode((self.width, self.height))
+        except pygame.error as error:
+            raise ValueError(
+                f"there is no display to open a window on ({error}); with SDL_VIDEODRIVER=dummy it works without one, "
+                "to write a --gif"
+            ) from error
+        pygame.display.set_caption("dynmap_rl")
         self.font = pygame.font.Font(None, LINE)
         self.renderer = Renderer(size, supersample=2)
 

@@ -41,15 +41,15 @@ def folder(tmp_path):
         append_metrics(tmp_path, step, loss_rgb=1 / step, error_position=0.1)
         append_metrics(tmp_path / "seed_0", step, loss=1 / step, seconds=None)
     Image.new("RGB", (8, 8)).save(tmp_path / "rollouts.gif")
-    write_json(tmp_path / "eval.json", {"command": "python recipes/decoupled.py --updates 7"})
     return tmp_path
 
 
 def test_the_page_is_whole_and_needs_nothing_beside_it(folder):
-    text = write_html(folder, "RGB+[P] & more", "SR 50 %").read_text()
+    command = "python recipes/decoupled.py --updates 7"
+    text = write_html(folder, "RGB+[P] & more", "SR 50 %", command).read_text()
     page = Page(text)
     assert page.open == []
-    for said in ("RGB+[P] & more", "SR 50 %", "updates", "python recipes/decoupled.py --updates 7"):
+    for said in ("RGB+[P] & more", "SR 50 %", "updates", command):
         assert said in page.text
     assert not any(tag in ("script", "link", "iframe") for tag, *_ in page.attributes)
     assert "<script>" not in text

@@ -63,16 +63,11 @@ def test_imagination_goes_on_without_frames(actor):
     blind.imagining = True
     blind.td["pixels"] = torch.zeros_like(blind.td["pixels"])  # it does not look
     latent, (state, _) = blind.states[0], blind.memory
+    wanted = torch.as_tensor(blind._expert_action(), dtype=torch.float32)[None]
     blind.step()
     world_model = actor.world_model
     with torch.no_grad():
-        predicted, state = world_model.step(
-            latent,
-            blind.td["action"]
-            if "action" in blind.td.keys()
-            else torch.as_tensor(blind.world.action, dtype=torch.float32)[None],
-            state,
-        )
+        predicted, state = world_model.step(latent, wanted, state)
         expected = world_model.decode_dynamics(predicted, state[0], state[2])["position"][0]
     np.testing.assert_allclose(blind.prediction["position"], expected.numpy(), atol=1e-5)
     seen.step()

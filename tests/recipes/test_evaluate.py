@@ -43,7 +43,7 @@ def trained(recording, tmp_path):
 
 def test_a_run_and_its_copy_for_lerobot_get_the_same_row(trained, tmp_path):
     common = "--episodes", "3", "--split", "validation"
-    result = run(tmp_path, "evaluate", "--policy", trained, "--seed", "1", *common)
+    result = run(tmp_path, "evaluate", "--policy", "trained", "--seed", "1", *common)
     assert result.returncode == 0, result.stderr
     ours = read_json(tmp_path / "runs/evaluate/bin_dropping_trained_seed_1_validation.json")
     assert ours["rows"]["first_scene_seed"] == scene_seed("validation", 0)
@@ -70,6 +70,8 @@ def test_the_shipped_policy_does_as_well_as_its_results_say(tmp_path):
     ("arguments", "message"),
     [
         (["--policy", "nothing"], "nothing holds no policy of LeRobot"),
+        (["--policy", "balance_reaching", "--seed", "7"], "holds no checkpoint"),
+        (["--expert", "bin_dropping"], "sees states of bin_dropping, which balance_reaching does not have"),
         (["--policy", "nothing", "--expert", "balance_reaching"], "name one of them"),
         (["--expert", "nobody"], "no expert at nobody"),
         (["--checkpoint", "iteration_999"], "choose from"),

@@ -1,10 +1,13 @@
 """The play recipe, without a display: what keys and mouse do, what is recorded."""
 
+import shutil
+
 import pytest
 from commands import run
 from PIL import Image
 
 from dynmap_rl.data import keep_episode, load_dataset, load_meta, publish_episodes
+from dynmap_rl.envs import scene_seed
 from dynmap_rl.envs.renderer import pygame
 from dynmap_rl.modules import make_policy, make_world_model, save_policy, save_world_model
 from dynmap_rl.play import PlayWindow, Session, session
@@ -96,14 +99,50 @@ def test_what_a_person_drove_becomes_a_dataset(tmp_path, monkeypatch):
     assert load_dataset(tmp_path / "mine", "train").shape == (2, 120)
     assert not (tmp_path / "mine.parts/old.tmp").exists()
 
+    scenes = [row["scene_seed"] for row in load_meta(tmp_path / "mine")["episodes"]]
+    assert len(set(scenes)) == 3 and scenes[:2] == [scene_seed("train", 0), scene_seed("train", 1)]
+
     other = run(tmp_path, "play", "--task", "bin_dropping", "--record", "mine")
     assert "mine is for human of balance_reaching, not for those of a person in bin_dropping" in other.stderr
+
+    shutil.rmtree(tmp_path / "mine.parts/0001")
+    lost = run(tmp_path, "play", "--record", "mine", "--steps", 1)
+    assert "mine has 3 episodes, but mine.parts no longer holds them all" in lost.stderr
+    assert load_dataset(tmp_path / "mine").shape == (3, 120)
+
+
+def test_demonstrations_of_ones_own_task(tmp_path, monkeypatch):
+    (tmp_path / "other_tasks.py").write_text(
+        "from dynmap_rl.envs.tasks import BalanceReaching\n"
+        "class Nearer(BalanceReaching):\n"
+        "    name = 'nearer'\n"
+        "    def is_success(self, world):\n"
+        "        return world.steps >= 120\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    arguments = "--task", "other_tasks:Nearer", "--record", "mine", "--steps", 141 + 120, "--size", 64
+    result = run(tmp_path, "play", *arguments)
+    assert result.returncode == 0, result.stderr
+    assert load_meta(tmp_path / "mine")["task"] == "other_tasks:Nearer"
+
+
+def test_without_a_display_there_is_one_clear_line(tmp_path, monkeypatch):
+    def fail(size):
+        raise pygame.error("No available video device")
+
+    monkeypatch.setattr(pygame.display, "set_mode", fail)
+    result = run(tmp_path, "play")
+    assert result.returncode == 2
+    assert result.stderr.startswith("error: there is no display to open a window on (No available video")
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["--task", "juggling"], "unknown task"),
+        (["--steps", "0"], "--steps at least 1"),
+        (["--gif", "film.gif"], "--gif needs --steps"),
+        (["--expert", "bin_dropping"], "sees states of bin_dropping, which balance_reaching does not have"),
         (["--driver", "policy"], "--driver is one of hand, expert, not 'policy'"),
         (["--policy", "nothing"], "no checkpoint"),
         (["--expert", "nobody"], "no expert at nobody"),

@@ -24,6 +24,7 @@ class LeRobotActor(TensorDictModuleBase):
     Args:
         path: a ``pretrained_model`` folder of ``lerobot-train``, or the id of a policy on the Hugging Face hub.
         device: to run on.
+        instruction: for policies that read one; our datasets have the task's ``description``.
 
     Raises:
         ValueError: there is no such policy.
@@ -32,8 +33,9 @@ class LeRobotActor(TensorDictModuleBase):
     in_keys = ["pixels", "agent_pos"]
     out_keys = ["action"]
 
-    def __init__(self, path: str | Path, device: torch.device | str = "cpu"):
+    def __init__(self, path: str | Path, device: torch.device | str = "cpu", instruction: str = ""):
         super().__init__()
+        self.instruction = instruction
         try:
             config = PreTrainedConfig.from_pretrained(str(path))
             config.device = str(device)
@@ -41,7 +43,7 @@ class LeRobotActor(TensorDictModuleBase):
             self.processors = make_pre_post_processors(
                 config, str(path), preprocessor_overrides={"device_processor": {"device": str(device)}}
             )
-        except (OSError, KeyError) as error:
+        except (OSError, KeyError, ValueError, ImportError) as error:
             reason = (str(error).strip() or type(error).__name__).splitlines()[0]
             raise ValueError(f"{path} holds no policy of LeRobot ({reason})") from error
         self.reset()
@@ -54,5 +56,7 @@ class LeRobotActor(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         before, after = self.processors
         observation = {CAMERA: tensordict["pixels"].float() / 255, OBS_STATE: tensordict["agent_pos"]}
-        action = self.policy.select_action(before({**observation, "task": [""] * len(tensordict)}))
+        action = self.policy.select_action(
+            before({**observation, "task": [self.instruction] * len(tensordict)})
+        )
         return tensordict.set("action", after(action).to(tensordict["agent_pos"]))
