@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     import torch
 
 
-LOCKS = {}  # of the folders of this process, held until it ends
+LOCKS = {}  # of this process's folders: released when nothing refers to them
 
 
 def write_json(path: Path, value) -> None:
@@ -58,15 +58,8 @@ def open_run(folder: Path, config, *, ignore: tuple[str, ...] = ()) -> Path:
     Raises:
         ValueError: the folder holds a run with other settings, or another process works in it.
     """
-    from filelock import FileLock, Timeout
-
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    try:
-        LOCKS[folder.resolve()] = FileLock(folder.resolve() / ".lock", timeout=0, is_singleton=True)
-        LOCKS[folder.resolve()].acquire()
-    except Timeout as error:
-        raise ValueError(f"{folder} is being run by another process; wait for it, or stop it") from error
+    lock_folder(folder)
     settings = json.loads(json.dumps(dataclasses.asdict(config), default=str))
     path = folder / "config.json"
     if path.exists():
@@ -84,6 +77,23 @@ def open_run(folder: Path, config, *, ignore: tuple[str, ...] = ()) -> Path:
     else:
         write_json(path, settings)
     return folder
+
+
+def lock_folder(folder: Path) -> None:
+    """Make the folder, and keep it for this process until it ends.
+
+    Raises:
+        ValueError: another process works in it.
+    """
+    from filelock import FileLock, Timeout
+
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder.resolve() / ".lock"
+    try:
+        LOCKS[path] = FileLock(path, timeout=0, is_singleton=True)
+        LOCKS[path].acquire()
+    except Timeout as error:
+        raise ValueError(f"another process works in {folder}; wait for it, or stop it") from error
 
 
 def replace_defaults(config, values: dict) -> None:

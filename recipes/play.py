@@ -60,12 +60,14 @@ def main(config: Config) -> None:
         raise ValueError("--size must be at least 64 and --steps at least 1")
     if config.gif and not config.steps:
         raise ValueError("--gif needs --steps, the number of steps that the film shows")
-    scene = config.scene
+    kept = 0
     if config.record:
         open_folder(config.record, task)
-        scene += len(list_shards(config.record, task))
+        kept = len(list_shards(config.record, task))
     # Demonstrations are of scenes for training, and every session begins with new ones.
-    session = Session(task, actor, config.expert, scene, split="train" if config.record else "validation")
+    session = Session(
+        task, actor, config.expert, config.scene + kept, split="train" if config.record else "validation"
+    )
     if config.driver:
         if config.driver not in session.drivers:
             raise ValueError(f"--driver is one of {', '.join(session.drivers)}, not {config.driver!r}")
@@ -75,7 +77,8 @@ def main(config: Config) -> None:
         play(config, task, session, window, frames, CONTROL_DT)
     finally:
         window.close()
-        if config.record and (count := len(list_shards(config.record, task))) > 1:
+        count = len(list_shards(config.record, task)) if config.record else 0
+        if count > max(kept, 1) or (count > 1 and not config.record.exists()):
             print(f"{count} episodes: {publish_episodes(config.record, task)}")
     if config.gif:
         save_film(frames, config.gif)

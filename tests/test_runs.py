@@ -58,7 +58,7 @@ def test_a_run_belongs_to_one_process(tmp_path):
     command = [sys.executable, "-c", code, str(tmp_path / "run"), str(Path(__file__).parent)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
         assert other.stdout.readline() == "open\n"
-        with pytest.raises(ValueError, match="is being run by another process; wait for it, or stop it"):
+        with pytest.raises(ValueError, match="another process works in .*; wait for it, or stop it"):
             runs.open_run(tmp_path / "run", Settings())
         other.kill()
     runs.open_run(tmp_path / "run", Settings())

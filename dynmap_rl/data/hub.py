@@ -78,7 +78,7 @@ def push_dataset(root: str | Path, repo_id: str) -> None:
 
 def draw_episodes(episodes: TensorDict, path: Path, rows: int = 3, columns: int = 8, zoom: int = 2) -> None:
     """Frames of the first episodes ``[E, T]``, evenly spaced in time, a row each."""
-    steps = np.linspace(0, episodes.shape[1] - 1, columns).round()
+    steps = np.linspace(0, episodes.shape[1] - 1, columns).round().astype(int)
     frames = episodes["pixels"][:rows, steps].permute(0, 3, 1, 4, 2)  # row, y, column, x, RGB
     picture = frames.flatten(2, 3).flatten(0, 1).numpy().repeat(zoom, 0).repeat(zoom, 1)
     if not cv2.imwrite(str(path), picture[..., ::-1]):

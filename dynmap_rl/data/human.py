@@ -6,11 +6,10 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-from filelock import FileLock, Timeout
 from tensordict import TensorDict
 
 from dynmap_rl.envs.tasks import get_task
-from dynmap_rl.runs import LOCKS, read_json, write_json
+from dynmap_rl.runs import lock_folder, read_json, write_json
 
 from .demonstrations import Plan
 from .loading import META, load_meta
@@ -75,7 +74,7 @@ def open_folder(root: str | Path, task: str) -> None:
     """Make the folder of the episodes.
 
     Raises:
-        ValueError: ``root`` is a dataset of another kind or task, or something else.
+        ValueError: ``root`` is a dataset of another kind or task, or something else, or another process records to it.
     """
     root, settings = Path(root), {"kind": KIND, "task": task}
     stored, path = settings, _parts(root) / "settings.json"
@@ -95,12 +94,8 @@ def open_folder(root: str | Path, task: str) -> None:
             f"{root} is for {stored.get('kind')} of {stored.get('task')}, not for those of a person in {task}; "
             "choose another folder"
         )
+    lock_folder(_parts(root))
     write_json(path, settings)
-    try:
-        LOCKS[path] = FileLock(path.with_name(".lock"), timeout=0, is_singleton=True)
-        LOCKS[path].acquire()
-    except Timeout as error:
-        raise ValueError(f"{root} is being recorded to by another process; end it first") from error
 
 
 def list_shards(root: str | Path, task: str) -> list[Shard]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 
@@ -49,9 +50,8 @@ def _states(world_model: WorldModel, episodes: TensorDictBase) -> dict[str, torc
 def _explained(x: torch.Tensor, x_test: torch.Tensor, y: torch.Tensor, y_test: torch.Tensor) -> torch.Tensor:
     """R^2 ``[D]`` of a linear map of ``x`` ``[N, F]`` fitted to ``y`` ``[N, D]`` by least squares."""
     mean, center = x.mean(0), y.mean(0)
-    weights = torch.linalg.lstsq(
-        x - mean, y - center, driver="gelsd"
-    ).solution  # also of states that are constant
+    # This driver also takes states that are constant.
+    weights = torch.linalg.lstsq(x - mean, y - center, driver="gelsd").solution
     rest = y_test - center - (x_test - mean) @ weights
     return 1 - rest.square().sum(0) / (y_test - y_test.mean(0)).square().sum(0)
 
@@ -65,23 +65,14 @@ def plot_probes(probes: dict[str, dict], path: Path) -> None:
         "How much of the dynamics a linear map of a state tells (R$^2$, held-out demonstrations)", fontsize=11
     )
     for axis, state in zip(axes, STATES, strict=True):
-        values = torch.tensor([[sum(p[state][q]) / 6 for q in DYNAMICS] for p in probes.values()])
-        axis.imshow(values.numpy(), vmin=0, vmax=1, cmap="Greens", aspect="auto")
+        values = np.array([[np.mean(p[state][q]) for q in DYNAMICS] for p in probes.values()])
+        axis.imshow(values, vmin=0, vmax=1, cmap="Greens", aspect="auto")
         axis.set_title(state, fontsize=10)
         axis.set_xticks(range(len(DYNAMICS)), DYNAMICS, fontsize=9)
         axis.set_yticks(range(len(probes)), probes, fontsize=9)
-        for (row, column), value in zip(
-            torch.cartesian_prod(*map(torch.arange, values.shape)), values.flatten(), strict=True
-        ):
-            axis.text(
-                column,
-                row,
-                f"{value:.2f}",
-                ha="center",
-                va="center",
-                fontsize=8,
-                color="w" if value > 0.6 else "k",
-            )
+        for (row, column), value in np.ndenumerate(values):
+            color = "w" if value > 0.6 else "k"
+            axis.text(column, row, f"{value:.2f}", ha="center", va="center", fontsize=8, color=color)
     save_figure(figure, path)
 
 

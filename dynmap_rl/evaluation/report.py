@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 
 from dynmap_rl.data import NO_TASK, load_meta
 from dynmap_rl.envs import scene_seed
@@ -24,14 +25,15 @@ SHARED_STARTS = 1000  # the paper's protocol uses the scenes after these
 
 
 def evaluate(
-    actor: Actor,
+    actor: TensorDictModuleBase,
     task: str,
     test_episodes: int = 1000,
     paper_episodes: int = 50,
     split: str = "test",
 ) -> dict[str, dict]:
     """One actor (see :func:`roll_out`) by both protocols: rows and summary on ``test_episodes`` shared start states
-    (``test``) and on ``paper_episodes`` others (``paper``, where there are any) of a split of the scenes. All episodes run as one batch.
+    (``test``) and on ``paper_episodes`` others (``paper``, where there are any) of a split of the scenes. All episodes
+    run as one batch.
 
     Raises:
         ValueError: more than 1,000 shared start states, which are all there are.

@@ -136,10 +136,10 @@ class Session:
         """What was done so far, ``[1, T]``, with the entries of a demonstration."""
         return torch.stack(self.steps, 1)
 
-    def _hand_action(self) -> torch.Tensor:
+    def _hand_action(self) -> np.ndarray:
         return self.hand.action(self.world.commanded, self.world.action)
 
-    def _expert_action(self) -> torch.Tensor:
+    def _expert_action(self) -> np.ndarray:
         state = torch.from_numpy(self.expert_task.state(self.world))
         return self.world.action_for(self.expert(state)[0].numpy())
 
