@@ -1,6 +1,7 @@
 from pathlib import Path
 
 import pytest
+import torch
 from commands import run
 
 from dynmap_rl.data import load_meta
@@ -34,6 +35,7 @@ def test_task_1s_expert_meets_the_obstacle_of_task_2(tmp_path):
 def trained(recording, tmp_path):
     """What of a run of task 3 is needed, with a policy that was not trained."""
     folder, constants = tmp_path / "trained", load_meta(recording)["normalization"]
+    torch.manual_seed(0)
     world_model = make_world_model(constants, ("position",))
     save_world_model(folder / "world_model", world_model)
     save_policy(folder / "seed_1/policy", make_policy(constants, "recurrent", world_model), world_model)
@@ -47,7 +49,8 @@ def test_a_run_and_its_copy_for_lerobot_get_the_same_row(trained, tmp_path):
     assert result.returncode == 0, result.stderr
     ours = read_json(tmp_path / "runs/evaluate/bin_dropping_trained_seed_1_validation.json")
     assert ours["rows"]["first_scene_seed"] == scene_seed("validation", 0)
-    assert f"PE {ours['summary']['PE']:.1f} mm   SR 0.0 %" in result.stdout
+    summary = ours["summary"]  # an untrained policy may well tip the block into the bin
+    assert f"PE {summary['PE']:.1f} mm   SR {summary['SR']:.1f} %" in result.stdout
 
     lerobot = pytest.importorskip("dynmap_rl.integrations.lerobot")
     exported = lerobot.export_to_lerobot(trained, tmp_path / "exported", seed=1)
