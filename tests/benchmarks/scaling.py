@@ -71,7 +71,7 @@ def draw(found: dict, path: Path) -> None:
         [line] = axes.loglog(sizes, times, "o-", label=name)
         axes.loglog(sizes, [times[-1] * size / sizes[-1] for size in sizes], ":", color=line.get_color())
     axes.set(xlabel="size", ylabel="time (s); dotted: proportional to size")
-    axes.legend()
+    figure.legend(loc="outside upper center", ncols=2)  # within the axes it would hide a point
     figure.savefig(path, dpi=120)
 
 
