@@ -169,33 +169,6 @@ def load_training_state(path: Path) -> dict | None:
     return state
 
 
-def save_weights(path: Path, module: torch.nn.Module) -> None:
-    """Write a module's state as safetensors, atomically."""
-    from safetensors.torch import save_file
-
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    save_file({k: v.detach().cpu().contiguous() for k, v in module.state_dict().items()}, temporary)
-    temporary.replace(path)
-
-
-def load_weights(path: Path, module: torch.nn.Module) -> None:
-    """Load safetensors into a module.
-
-    Raises:
-        ValueError: the file is missing, damaged, or does not fit the module.
-    """
-    from safetensors.torch import load_file
-
-    if not Path(path).exists():
-        raise ValueError(f"no weights at {path}")
-    try:
-        module.load_state_dict(load_file(path))
-    except Exception as error:
-        raise ValueError(f"{path} does not hold this model's weights: {error}") from error
-
-
 def choose_device(name: str) -> torch.device:
     """The device of a name; ``auto`` is the GPU where there is one.
 

@@ -19,6 +19,7 @@ from dynmap_rl.loggers import log_metrics
 from dynmap_rl.modules import WorldModel, mixed_precision
 from dynmap_rl.objectives import ImitationLoss, JointLoss, WorldModelLoss
 
+ADVICE = "the last training state before is kept; run again with a lower learning rate, in another --run"
 GROUPS = {"": [0, 1, 3, 4], "_angle": [2, 5]}  # entries of our tasks' dynamics that have one unit
 
 
@@ -40,7 +41,7 @@ def train_world_model(
             ``task`` is none: what may be changed in the frames of others is not known.
 
     Raises:
-        ValueError: a loss is not finite.
+        ValueError: the loss is not finite or diverges; the last training state, from before, is kept.
     """
 
     def held_out() -> dict[str, float]:
@@ -125,12 +126,12 @@ def _fit(
     generator = torch.Generator(device).manual_seed(seed)
     episodes = episodes.select("pixels", "action", "goal", "dynamics", "disturbed", strict=False).to(device)
 
-    start, path = 0, folder / "checkpoint" / "world_model.pt"
+    start, first, path = 0, None, folder / "checkpoint" / "world_model.pt"
     if state := runs.load_training_state(path):
         model.load_state_dict(state["model"])
         optimizer.load_state_dict(state["optimizer"])
         generator.set_state(state["generator"].cpu())
-        start = state["update"]
+        start, first = state["update"], state.get("first_loss")
     runs.truncate_metrics(folder, start)
     progress = tqdm(range(start, settings.updates), folder.name, settings.updates, initial=start)
     for update in progress:
@@ -141,10 +142,11 @@ def _fit(
         windows = add_distractors(windows, generator, settings.distractors)
         with mixed_precision(device):
             losses = loss_module(windows)
-        step(sum(losses.values()), optimizer)
+        norm = step(sum(losses.values()), optimizer)
         done = update + 1
-        if done % 50 == 0 or done == settings.updates:
-            losses = {name: check_finite(value) for name, value in losses.items()}
+        if done % 50 == 0 or done in (1, settings.updates):
+            losses = {name: value.item() for name, value in losses.items()}
+            first = check_loss(sum(losses.values()), norm, first)
             progress.set_postfix({k.removeprefix("loss_"): f"{v:.3f}" for k, v in losses.items()})
         if done % save_every == 0 or done == settings.updates:
             log_metrics(folder, done, settings.logger, **losses, **held_out())
@@ -154,6 +156,7 @@ def _fit(
                 optimizer=optimizer.state_dict(),
                 generator=generator.get_state(),
                 update=done,
+                first_loss=first,
             )
 
 
@@ -176,19 +179,20 @@ def train_policy(
     features, held_out = features.to(device), held_out.to(device)
     generator = torch.Generator(device).manual_seed(seed)
     loss_module, plain = ImitationLoss(policy, settings.emphasis), ImitationLoss(policy)
-    progress = tqdm(range(settings.policy_updates), f"policy {seed}", position=seed)
+    progress, first = tqdm(range(settings.policy_updates), f"policy {seed}", position=seed), None
     for update in progress:
         set_learning_rate(optimizer, settings.policy_learning_rate, update, settings.policy_updates)
         index = torch.randint(len(features), (settings.policy_batch,), generator=generator, device=device)
         batch = features[index]
         with mixed_precision(device):
             loss = loss_module(batch)["loss_policy"]
-        step(loss, optimizer)
+        norm = step(loss, optimizer)
         done = update + 1
+        if done % 100 == 0 or done in (1, settings.policy_updates):
+            first = check_loss(loss.item(), norm, first)
         if done % 100 == 0 or done == settings.policy_updates:
             with torch.no_grad():
                 validation = plain(held_out)["loss_policy"]
-            loss = check_finite(loss)
             log_metrics(folder, done, settings.logger, loss=loss, held_out_loss=validation)
             progress.set_postfix(loss=f"{loss:.4f}", held_out=f"{validation:.4f}")
 
@@ -246,17 +250,23 @@ def set_learning_rate(optimizer, peak: float, update: int, updates: int) -> None
         group["lr"] = peak * factor
 
 
-def step(loss: torch.Tensor, optimizer) -> None:
-    """One optimiser step with clipped gradients. Nothing in it waits for an accelerator."""
+def step(loss: torch.Tensor, optimizer) -> torch.Tensor:
+    """One optimiser step with clipped gradients; their norm. Nothing in it waits for an accelerator."""
     optimizer.zero_grad()
     loss.backward()
-    nn.utils.clip_grad_norm_([p for g in optimizer.param_groups for p in g["params"]], 1.0)
+    norm = nn.utils.clip_grad_norm_([p for g in optimizer.param_groups for p in g["params"]], 1.0)
     optimizer.step()
+    return norm
 
 
-def check_finite(loss: torch.Tensor) -> float:
-    """The loss as a number; ``ValueError`` where it is none."""
-    value = loss.item()
-    if not math.isfinite(value):
-        raise ValueError("the loss is not finite; the last training state is kept, try a lower learning rate")
-    return value
+def check_loss(loss: float, norm: torch.Tensor, first: float | None = None) -> float:
+    """The run's first loss, or this one where it is the first.
+
+    Raises:
+        ValueError: the loss or the gradients' norm is not finite, or the loss is ten times what it was at first.
+    """
+    if not (math.isfinite(loss) and norm.isfinite()):
+        raise ValueError(f"the loss is not finite; {ADVICE}")
+    if first is not None and loss > 10 * first:
+        raise ValueError(f"the loss diverges ({loss:.3g}, at first {first:.3g}); {ADVICE}")
+    return loss if first is None else first

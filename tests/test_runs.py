@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from torch import nn
 
 from dynmap_rl import runs
 
@@ -103,32 +102,11 @@ def test_training_state_restores_values_and_random_numbers(tmp_path):
     assert [p.name for p in path.parent.iterdir()] == ["state.pt"]
 
 
-def test_weights_round_trip(tmp_path):
-    module, other = nn.Linear(3, 2), nn.Linear(3, 2)
-    runs.save_weights(tmp_path / "w.safetensors", module)
-    runs.load_weights(tmp_path / "w.safetensors", other)
-    assert torch.equal(module.weight, other.weight) and torch.equal(module.bias, other.bias)
-
-
-def test_weights_that_do_not_fit_raise(tmp_path):
-    runs.save_weights(tmp_path / "w.safetensors", nn.Linear(3, 2))
-    for module in (nn.Linear(4, 2), nn.Linear(3, 2, bias=False)):
-        with pytest.raises(ValueError, match=r"w\.safetensors does not hold this model's weights"):
-            runs.load_weights(tmp_path / "w.safetensors", module)
-    with pytest.raises(ValueError, match=r"no weights at .*absent\.safetensors"):
-        runs.load_weights(tmp_path / "absent.safetensors", nn.Linear(3, 2))
-
-
 @pytest.mark.parametrize(
     "name, save, load",
     [
         ("config.json", lambda p: runs.write_json(p, {"a": 1}), runs.read_json),
         ("state.pt", lambda p: runs.save_training_state(p, step=1), runs.load_training_state),
-        (
-            "w.safetensors",
-            lambda p: runs.save_weights(p, nn.Linear(3, 2)),
-            lambda p: runs.load_weights(p, nn.Linear(3, 2)),
-        ),
     ],
 )
 @pytest.mark.parametrize("damage", [lambda b: b[: len(b) // 2], lambda b: b"", lambda b: b"x" * len(b)])

@@ -1,3 +1,4 @@
+import re
 from types import SimpleNamespace
 
 import pytest
@@ -5,10 +6,10 @@ import torch
 from safetensors.torch import load_file, save_file
 from tensordict import TensorDict
 
-from dynmap_rl import frozen, runs
-from dynmap_rl.data import compute_features
+from dynmap_rl import frozen, runs, training
+from dynmap_rl.data import compute_features, sample_windows
 from dynmap_rl.modules import DYNAMICS, make_policy, make_world_model, mixed_precision
-from dynmap_rl.training import fingerprint, train_policy, train_world_model
+from dynmap_rl.training import check_loss, fingerprint, train_policy, train_world_model
 
 CONSTANTS = {
     "action": {"low": [-0.02, -0.02, -0.05], "high": [0.02, 0.02, 0.05]},
@@ -155,8 +156,65 @@ def test_a_copy_begins_anywhere_with_an_empty_memory_and_ends_where_the_episode_
     assert len(starts) > 2 and max(starts) < 6
 
 
-def test_a_loss_that_is_not_finite_stops_the_run(tmp_path):
-    episodes = make_episodes()
-    episodes["dynamics", "position"][:] = float("nan")
+def train_from(update, change, folder, monkeypatch, **settings):
+    """Windows are changed from an update on; what is then left of the training."""
+    calls = []
+
+    def sample(*args):
+        windows = sample_windows(*args)
+        calls.append(1)
+        return change(windows) if len(calls) > update else windows
+
+    monkeypatch.setattr(training, "sample_windows", sample)
+    episodes = dict.fromkeys(("train", "eval"), make_episodes())
+    with pytest.raises(
+        ValueError, match="last training state before is kept; run again with a lower"
+    ) as error:
+        train_world_model(
+            make_model(), episodes, folder, SimpleNamespace(**{**vars(SETTINGS), **settings}), save_every=50
+        )
+    assert all(row["step"] <= update for row in runs.read_metrics(folder))
+    return str(error.value), runs.load_training_state(folder / "checkpoint/world_model.pt")
+
+
+def with_nan(windows):
+    windows["dynamics", "position"][:] = float("nan")
+    return windows
+
+
+def exploding(windows):
+    windows["dynamics", "position"].mul_(1e6)
+    return windows
+
+
+@pytest.mark.parametrize(
+    ("change", "message"), [(with_nan, "not finite"), (exploding, r"diverges \(\d.*, at first \d")]
+)
+def test_a_loss_that_is_not_finite_or_diverges_leaves_the_last_good_state(
+    tmp_path, monkeypatch, change, message
+):
+    said, state = train_from(50, change, tmp_path, monkeypatch, updates=100)
+    assert re.search(message, said)
+    assert state["update"] == 50 and all(value.isfinite().all() for value in state["model"].values())
+
+
+def test_a_learning_rate_that_is_too_high_stops_before_anything_is_kept(tmp_path, monkeypatch):
+    _, state = train_from(0, lambda windows: windows, tmp_path, monkeypatch, updates=100, learning_rate=1e9)
+    assert state is None
+
+
+def test_an_update_that_makes_the_weights_nan_is_noticed_at_once():
+    """Its loss is still finite."""
+    assert check_loss(2.0, torch.tensor(5.0)) == 2.0
+    assert check_loss(2.0, torch.tensor(5.0), 3.0) == 3.0
     with pytest.raises(ValueError, match="not finite"):
-        train_world_model(make_model(), {"train": episodes, "eval": episodes}, tmp_path, SETTINGS)
+        check_loss(2.0, torch.tensor(float("inf")))
+
+
+def test_a_policys_loss_is_watched_too(tmp_path):
+    model = make_model().eval().requires_grad_(False)
+    features = compute_features(model, make_episodes(), copies=1, generator=torch.Generator().manual_seed(0))
+    features["action"][:] = float("nan")
+    with pytest.raises(ValueError, match="not finite"):
+        train_policy(make_policy(CONSTANTS, "recurrent", model), features, features, tmp_path, SETTINGS, 0)
+    assert runs.read_metrics(tmp_path) == []

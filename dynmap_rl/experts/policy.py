@@ -13,7 +13,8 @@ from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor
 
 from dynmap_rl.envs.tasks import BalanceReaching
 from dynmap_rl.envs.world import EPISODE_STEPS, World
-from dynmap_rl.runs import load_weights, read_json
+from dynmap_rl.runs import read_json
+from dynmap_rl.weights import load_module
 
 CHECKPOINTS = Path(__file__).parent / "checkpoints"
 
@@ -97,9 +98,11 @@ def load_expert(expert: str | Path, checkpoint: str | None = None) -> ExpertNetw
         raise ValueError(f"no checkpoint {checkpoint!r} of the expert {expert}; choose from {known}")
     folder = find_expert(expert)
     facts = read_json(folder / f"{checkpoint}.json")
-    network = ExpertNetwork(facts["state_size"], tuple(facts["acceleration_limit"]), facts["hidden"])
-    load_weights(folder / f"{checkpoint}.safetensors", network)
-    return network.eval().requires_grad_(False)
+
+    def make() -> ExpertNetwork:
+        return ExpertNetwork(facts["state_size"], tuple(facts["acceleration_limit"]), facts["hidden"])
+
+    return load_module(folder / f"{checkpoint}.safetensors", make).eval().requires_grad_(False)
 
 
 def find_expert(expert: str | Path) -> Path:

@@ -20,6 +20,8 @@ from dynmap_rl.envs import scene_seed
 from dynmap_rl.envs.tasks import BalanceReaching
 from dynmap_rl.envs.world import EPISODE_STEPS, World
 from dynmap_rl.loggers import log_metrics
+from dynmap_rl.training import check_loss
+from dynmap_rl.weights import save_weights
 
 from .policy import ExpertNetwork, make_actor
 
@@ -43,6 +45,9 @@ def train_ppo(
             ``gae_lambda``, ``clip``, ``entropy``, ``checkpoint_every``, ``eval_episodes`` and ``final_episodes``.
         judge: rates of the network's mean action on so many fresh scenes, at least ``success`` and ``drop``.
         facts: about the run, written to the JSON of each checkpoint with what ``judge`` says.
+
+    Raises:
+        ValueError: the loss is not finite; the last training state, from before, is kept.
     """
     inputs, width = network.mlp[0].in_features, network.mlp[0].out_features
     actor = make_actor(network)
@@ -103,7 +108,7 @@ def train_ppo(
         if last or (iteration + 1) % settings.checkpoint_every == 0:
             judged = judge(settings.final_episodes if last else settings.eval_episodes)
             path = folder / "checkpoint" / f"iteration_{iteration + 1:03d}"
-            runs.save_weights(path.with_suffix(".safetensors"), network)
+            save_weights(path.with_suffix(".safetensors"), network)
             at = {"iteration": iteration + 1, "frames": metrics["frames"], "seconds": round(seconds, 1)}
             runs.write_json(path.with_suffix(".json"), judged | facts | at)
             progress.write(
@@ -122,7 +127,7 @@ def train_ppo(
 def update(
     batch: TensorDictBase, loss_module: ClipPPOLoss, advantage: GAE, optimizer, epochs: int, minibatch: int
 ) -> dict[str, float]:
-    """PPO's epochs of minibatches over one batch ``[N, T]``."""
+    """PPO's epochs of minibatches over one batch ``[N, T]``; ``ValueError`` where the last loss is not finite."""
     with torch.no_grad():
         batch = advantage(batch)
     batch = batch.select(
@@ -134,8 +139,9 @@ def update(
             loss = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
             optimizer.zero_grad()
             loss.backward()
-            torch.nn.utils.clip_grad_norm_(loss_module.parameters(), 0.5)
+            norm = torch.nn.utils.clip_grad_norm_(loss_module.parameters(), 0.5)
             optimizer.step()
+    check_loss(loss.item(), norm)
     return {k: losses[k].item() for k in ("loss_objective", "loss_critic", "entropy")}
 
 

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import torch
 
-from dynmap_rl.runs import load_weights, read_json, save_weights, write_json
+from dynmap_rl.runs import read_json, write_json
+from dynmap_rl.weights import load_module, save_weights
 
 from .normalization import Normalizer
 from .policy import FeedforwardPolicy, RecurrentPolicy
@@ -58,11 +59,12 @@ def load_world_model(folder: Path) -> WorldModel:
     arguments = _read_arguments(folder)
     if "dynamics" not in arguments:
         raise ValueError(f"{folder} holds a policy, not a world model")
-    arguments["action"] = _blank(arguments["action"])
-    arguments["dynamics"] = {q: _blank(size) for q, size in arguments["dynamics"].items()}
-    model = WorldModel(**arguments)
-    load_weights(Path(folder) / "weights.safetensors", model)
-    return model.eval()
+
+    def make() -> WorldModel:
+        dynamics = {q: _blank(size) for q, size in arguments["dynamics"].items()}
+        return WorldModel(**{**arguments, "action": _blank(arguments["action"]), "dynamics": dynamics})
+
+    return load_module(Path(folder) / "weights.safetensors", make).eval()
 
 
 def save_policy(folder: Path, policy: FeedforwardPolicy | RecurrentPolicy, world_model: WorldModel) -> None:
@@ -84,11 +86,13 @@ def load_policy(folder: Path) -> FeedforwardPolicy | RecurrentPolicy:
     arguments = _read_arguments(folder)
     if "kind" not in arguments:
         raise ValueError(f"{folder} holds a world model, not a policy")
-    kind = POLICIES[arguments.pop("kind")]
-    arguments |= {"action": _blank(arguments["action"]), "goal": _blank(arguments["goal"])}
-    policy = kind(**arguments)
-    load_weights(Path(folder) / "weights.safetensors", policy)
-    return policy.eval()
+    check_policy(kind := arguments.pop("kind"))
+
+    def make() -> FeedforwardPolicy | RecurrentPolicy:
+        normalizers = {name: _blank(arguments[name]) for name in ("action", "goal")}
+        return POLICIES[kind](**{**arguments, **normalizers})
+
+    return load_module(Path(folder) / "weights.safetensors", make).eval()
 
 
 def load_actor(run: str | Path, seed: int = 0) -> Actor:
@@ -118,7 +122,9 @@ def _read_arguments(folder: Path) -> dict:
     path = Path(folder) / "arguments.json"
     if not path.exists():
         raise ValueError(f"{folder} holds no checkpoint (no arguments.json); train one first")
-    return read_json(path)
+    if not isinstance(arguments := read_json(path), dict):
+        raise ValueError(f"{path} holds no arguments of a module")
+    return arguments
 
 
 def _blank(size: int) -> Normalizer:

@@ -16,7 +16,7 @@ class Normalizer(nn.Module):
     def __init__(self, low: torch.Tensor, high: torch.Tensor):
         super().__init__()
         low, high = torch.as_tensor(low, dtype=torch.float32), torch.as_tensor(high, dtype=torch.float32)
-        if low.shape != high.shape or not bool((low < high).all()):
+        if low.shape != high.shape or not (low.is_meta or bool((low < high).all())):
             raise ValueError(f"low must be below high, got {low.tolist()} and {high.tolist()}")
         self.register_buffer("center", (low + high) / 2)
         self.register_buffer("scale", (high - low) / 2)
