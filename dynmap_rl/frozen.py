@@ -6,6 +6,7 @@ and the weights of the world model are shown to be the same before and after.
 
 from __future__ import annotations
 
+import errno
 import shutil
 from pathlib import Path
 
@@ -72,14 +73,24 @@ def train_policies(
         features = data.compute_features(
             world_model, episodes["train"], settings.copies, generator, recolor=recolor
         )
-        features.cpu().memmap(folder / "features" / "train")
-        data.compute_features(world_model, episodes["eval"]).cpu().memmap(folder / "features" / "eval")
-        arguments = [(settings, folder, constants, seed, frozen) for seed in todo]
-        runs.run_processes(_train_and_evaluate, arguments, settings.threads)
-        shutil.rmtree(folder / "features")
+        held_out = data.compute_features(world_model, episodes["eval"])
+        check_space(folder, features.bytes() + held_out.bytes())
+        try:
+            for name, values in (("train", features), ("eval", held_out)):
+                values.cpu().memmap(folder / "features" / name)
+            arguments = [(settings, folder, constants, seed, frozen) for seed in todo]
+            runs.run_processes(_train_and_evaluate, arguments, settings.threads)
+        finally:
+            shutil.rmtree(folder / "features", ignore_errors=True)
     if fingerprint(modules.load_world_model(folder / "world_model")) != frozen:
         raise ValueError(f"the frozen world model of {folder} has changed; delete the folder and run again")
     return frozen
+
+
+def check_space(folder: Path, size: int) -> None:
+    """Raises ``OSError`` where ``size`` bytes do not fit: a process that maps a file into memory would be killed."""
+    if (free := shutil.disk_usage(folder).free) < size:
+        raise OSError(errno.ENOSPC, f"{size / 1e6:.0f} MB are needed, {free / 1e6:.0f} are free", str(folder))
 
 
 def _train_and_evaluate(arguments: tuple) -> None:

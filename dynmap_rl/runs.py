@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import errno
+import io
 import json
 import math
 import multiprocessing
@@ -28,16 +30,33 @@ if TYPE_CHECKING:
     import torch
 
 
+HINTS = {
+    **dict.fromkeys(
+        (errno.ENOSPC, errno.EDQUOT, errno.EFBIG), "make room; the same command goes on where it was"
+    ),
+    **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "choose a folder that can be written to"),
+}
 LOCKS = {}  # of this process's folders: released when nothing refers to them
 
 
 def write_json(path: Path, value) -> None:
-    """Write ``value`` under a temporary name, then rename: the file is whole or absent."""
+    """Write ``value`` as :func:`write_bytes` does."""
+    write_bytes(path, f"{_dump(value)}\n".encode())
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write under a temporary name, then rename: the file is whole or as it was, and nothing else is left."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(_dump(value) + "\n")
-    temporary.replace(path)
+    try:
+        temporary.write_bytes(data)
+        temporary.replace(path)
+    except BaseException as error:
+        temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            error.filename = str(path)
+        raise
 
 
 def read_json(path: Path):
@@ -133,22 +152,16 @@ def read_metrics(folder: Path) -> list[dict]:
 def truncate_metrics(folder: Path, step: int) -> None:
     """Drop the lines after ``step``: what a killed run wrote beyond its last training state."""
     rows = [row for row in read_metrics(folder) if row["step"] <= step]
-    path = Path(folder) / "metrics.jsonl"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(".metrics.jsonl")
-    temporary.write_text("".join(json.dumps(row) + "\n" for row in rows))
-    temporary.replace(path)
+    write_bytes(Path(folder) / "metrics.jsonl", "".join(json.dumps(row) + "\n" for row in rows).encode())
 
 
 def save_training_state(path: Path, **state) -> None:
     """Save tensors and plain values, with the state of torch's generator, atomically."""
     import torch
 
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    torch.save({**state, "rng": torch.get_rng_state()}, temporary)
-    temporary.replace(path)
+    buffer = io.BytesIO()
+    torch.save({**state, "rng": torch.get_rng_state()}, buffer)
+    write_bytes(path, buffer.getbuffer())
 
 
 def load_training_state(path: Path) -> dict | None:
@@ -253,7 +266,8 @@ def run_recipe(main, config_class) -> None:
     except (ValueError, OSError, argparse.ArgumentError, draccus.utils.DraccusException) as error:
         if debug:
             raise
-        print(f"error: {error}", file=sys.stderr)
+        hint = HINTS.get(getattr(error, "errno", None))
+        print(f"error: {error}{(hint and f'; {hint}') or ''}", file=sys.stderr)
         sys.exit(2)
 
 

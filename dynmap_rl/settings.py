@@ -63,7 +63,7 @@ def check_settings(settings) -> list[int]:
             "--camera and --goal are for --task none; our own tasks have one camera and their goal"
         )
     elif settings.dataset and (task := data.load_meta(settings.dataset)["task"]) != settings.task:
-        raise ValueError(f"{settings.dataset} holds the task {task}, not {settings.task}")
+        raise ValueError(f"{settings.dataset} is of {task}, not of {settings.task}; choose another --dataset")
     return seeds
 
 

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 
 import torch
 from safetensors import safe_open
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import nn
+
+from dynmap_rl.runs import write_bytes
 
 
 def save_weights(path: Path, module: nn.Module) -> None:
     """Write a module's state as safetensors, atomically."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    save_file({k: v.detach().cpu().contiguous() for k, v in module.state_dict().items()}, temporary)
-    temporary.replace(path)
+    write_bytes(path, save({k: v.detach().cpu().contiguous() for k, v in module.state_dict().items()}))
 
 
 def load_module[Module: nn.Module](path: Path, make: Callable[[], Module]) -> Module:

@@ -59,7 +59,8 @@ def run_cell(cell: Cell, config: Config, root: Path) -> str | None:
     log.parent.mkdir(parents=True, exist_ok=True)
     with open(log, "a") as file:
         if subprocess.run(command, cwd=root, stdout=file, stderr=file).returncode:
-            return f"{cell.name} failed; see {config.runs / cell.name}.log"
+            said = log.read_text().splitlines()[-1:]
+            return f"{cell.name} failed; see {config.runs / cell.name}.log, which ends with {said}"
     write_json(root / config.results / f"{cell.name}.json", read_json(root / folder / "eval.json"))
     return None
 

@@ -8,13 +8,11 @@ from pathlib import Path
 
 from tensordict import TensorDict
 
-from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.runs import lock_folder, read_json, write_json
 
 from .demonstrations import Plan
 from .loading import META, load_meta
-from .recording import FORMAT, ROWS, Shard, describe_episode, merge_shards
-from .writing import write_episodes
+from .recording import FORMAT, Shard, merge_shards, write_shard
 
 KIND = "human"
 
@@ -32,13 +30,7 @@ def keep_episode(root: str | Path, task: str, episode: TensorDict, scene_seed: i
     open_folder(root, task)
     shards = list_shards(root, task)
     number = 1 + max((int(shard.folder.name) for shard in shards), default=-1)
-    folder = _parts(root) / f"{number:04d}"
-    temporary = folder.with_name(f"{folder.name}.tmp")
-    shutil.rmtree(temporary, ignore_errors=True)  # of a killed process
-    write_episodes(temporary, episode, get_task(task).description)
-    plan = Plan(scene_seed, checkpoint=KIND)
-    write_json(temporary / ROWS, [describe_episode(task, plan, episode[0])])
-    temporary.replace(folder)
+    write_shard(_parts(root) / f"{number:04d}", task, [Plan(scene_seed, checkpoint=KIND)], episode)
     return len(shards) + 1
 
 

@@ -208,11 +208,20 @@ def _record_shard(shard: Shard) -> None:
         plans, episodes = _roll_out_shard(shard)
     finally:
         torch.set_num_threads(threads)
-    temporary = shard.folder.with_name(f"{shard.folder.name}.tmp")
-    write_episodes(temporary, episodes, get_task(shard.task).description)
-    rows = [describe_episode(shard.task, *e) for e in zip(plans, episodes, strict=True)]
-    write_json(temporary / ROWS, rows)
-    temporary.replace(shard.folder)
+    write_shard(shard.folder, shard.task, plans, episodes)
+
+
+def write_shard(folder: Path, task: str, plans: list[Plan], episodes: TensorDict) -> None:
+    """A dataset of its own with what is known of its episodes ``[E, T]``; it appears when it is whole."""
+    temporary = folder.with_name(f"{folder.name}.tmp")
+    try:
+        shutil.rmtree(temporary, ignore_errors=True)  # of a killed process
+        write_episodes(temporary, episodes, get_task(task).description)
+        rows = [describe_episode(task, *e) for e in zip(plans, episodes, strict=True)]
+        write_json(temporary / ROWS, rows)
+        temporary.replace(folder)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _roll_out_shard(shard: Shard) -> tuple[list[Plan], TensorDict]:

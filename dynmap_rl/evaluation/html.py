@@ -7,7 +7,7 @@ import html
 import io
 from pathlib import Path
 
-from dynmap_rl.runs import read_json, read_metrics
+from dynmap_rl.runs import read_json, read_metrics, write_bytes
 
 STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 60em; margin: 2em auto; padding: 0 1em; color: #222 }
@@ -54,10 +54,8 @@ def write_html(folder: Path, title: str, row: str, command: str = "") -> Path:
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>'
         f"<style>{STYLE}</style></head><body>{''.join(parts)}</body></html>\n"
     )
-    path, temporary = folder / "report.html", folder / ".report.html"
-    temporary.write_text(page, encoding="utf-8")
-    temporary.replace(path)
-    return path
+    write_bytes(folder / "report.html", page.encode())
+    return folder / "report.html"
 
 
 def draw_curves(curves: dict[str, list[dict]], columns: int = 3) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 
 from dynmap_rl.envs.renderer import Renderer, pygame
@@ -48,6 +50,8 @@ class PlayWindow:
         try:
             pygame.display.init()
             self.screen = pygame.display.set_mode((self.width, self.height))
+            if pygame.display.get_driver() == "offscreen" and "SDL_VIDEODRIVER" not in os.environ:
+                raise pygame.error("SDL finds none")  # but would draw where nobody sees it
         except pygame.error as error:
             raise ValueError(
                 f"there is no display to open a window on ({error}); with SDL_VIDEODRIVER=dummy it works without one, "

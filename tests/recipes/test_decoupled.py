@@ -116,18 +116,3 @@ def test_smoke_run_of_another_task(recordings, tmp_path, capsys, task):
     printed = capsys.readouterr().out
     assert f"RGB+[P+V], recurrent policy, {task}" in printed
     assert "\n  paper  " not in printed, "its world models are of task 1"
-
-
-def test_an_unknown_option_gets_one_clear_line(tmp_path):
-    result = run(tmp_path, "decoupled", "--bogus", "1")
-    assert result.returncode == 2
-    assert "unrecognized arguments: --bogus" in result.stderr
-    assert "Traceback" not in result.stderr
-
-
-def test_other_settings_on_the_same_folder_are_refused(smoke, monkeypatch):
-    folder, _ = smoke
-    monkeypatch.chdir(folder)
-    existing = Path("runs/decoupled/balance_reaching/position_velocity_recurrent_smoke")
-    with pytest.raises(ValueError, match=r"other settings \(beta_z: 0.1 there, 3.0 here\)"):
-        main(Config(smoke=True, run=existing, beta_z=3.0))

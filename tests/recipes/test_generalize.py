@@ -95,7 +95,7 @@ def test_a_jointly_trained_world_model_stands_beside_the_papers(smoke, tmp_path,
         ),
         (
             ["--task", "bin_dropping", "--dataset", "datasets/balance_reaching_smoke"],
-            "holds the task balance_reaching",
+            "is of balance_reaching, not of",
         ),
     ],
 )
