@@ -1,13 +1,20 @@
 """The report page: whole, well-formed, and without anything from elsewhere."""
 
+import importlib.util
+import json
+import subprocess
+import sys
 from html.parser import HTMLParser
+from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 
 from dynmap_rl.evaluation import write_html
 from dynmap_rl.runs import append_metrics, write_json
 
+BROWSER = Path(__file__).parents[1] / "browser.py"
 VOID = {"meta", "img", "br", "hr", "link"}
 
 
@@ -68,3 +75,39 @@ def test_the_same_run_gives_the_same_page(folder):
 def test_a_run_without_results_has_a_page_too(tmp_path):
     write_json(tmp_path / "config.json", {"seed": 0})
     assert "seed" in Page(write_html(tmp_path, "title", "row").read_text()).text
+
+
+def open_in_browser(page, picture):
+    if importlib.util.find_spec("PySide6") is None:
+        pytest.skip("needs a browser: pip install 'dynmap_rl[browser]'")
+    result = subprocess.run(
+        [sys.executable, BROWSER, page, picture], capture_output=True, text=True, timeout=200
+    )
+    if "cannot open shared object file" in result.stderr:
+        pytest.skip(f"the browser lacks a library: {result.stderr.splitlines()[-1]}")
+    assert result.returncode == 0, result.stderr
+    return json.loads(result.stdout)
+
+
+def test_a_browser_shows_the_whole_page_and_asks_for_nothing_else(folder, tmp_path):
+    rng = np.random.default_rng(0)
+    frames = [Image.fromarray(rng.integers(0, 255, (64, 96, 3), dtype=np.uint8)) for _ in range(3)]
+    frames[0].save(folder / "rollouts.gif", save_all=True, append_images=frames[1:])
+    (folder / "figures").mkdir()
+    Image.new("RGB", (320, 40), "green").save(folder / "figures/dynamics.png")
+    page = write_html(folder, "RGB+[P] & more", "SR 50 %", "python recipes/decoupled.py")
+    seen = open_in_browser(page, tmp_path / "page.png")
+    assert seen["loaded"] and seen["requests"] == [page.as_uri()] and seen["console"] == []
+    assert seen["images"] == [96, 320], "every picture is drawn, at its own size"
+    assert len(seen["drawings"]) == 1 and seen["drawings"][0] > 500, "the curves"
+    for said in (
+        "RGB+[P] & more",
+        "SR 50 %",
+        "Rollouts in closed loop",
+        "<script>alert(1)</script>",
+        "updates",
+    ):
+        assert said in seen["text"]
+    shown = np.asarray(Image.open(tmp_path / "page.png").convert("RGB"))
+    green = (shown == (0, 128, 0)).all(-1)
+    assert green.sum() > 5000, "what the picture holds is on the screen"
