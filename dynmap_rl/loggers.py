@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import functools
 import importlib.util
+import uuid
 from pathlib import Path
 
-from dynmap_rl.runs import append_metrics
+from dynmap_rl.runs import append_metrics, write_bytes
 
 LOGGERS = "tensorboard", "wandb", "trackio"
 
@@ -39,4 +40,14 @@ def _open(name: str, folder: Path):
 
     if name == "tensorboard":
         return get_logger(name, str(folder), "tensorboard")
-    return get_logger(name, str(folder), folder.as_posix(), **{f"{name}_kwargs": {"project": "dynmap_rl"}})
+    options = {"project": "dynmap_rl"}
+    if name == "wandb":  # a run for each of a process's seeds, and the same one when it goes on
+        options |= {"id": _run_id(folder), "reinit": "create_new"}
+    return get_logger(name, str(folder), folder.as_posix(), **{f"{name}_kwargs": options})
+
+
+def _run_id(folder: Path) -> str:
+    path = folder / "wandb" / "id"
+    if not path.exists():
+        write_bytes(path, uuid.uuid4().hex[:8].encode())
+    return path.read_text()

@@ -46,8 +46,18 @@ def test_others_are_torchrls_with_the_run_s_name(tmp_path, monkeypatch, name):
     log_metrics(tmp_path, 1, name, loss=0.5)
     log_metrics(tmp_path, 2, name, loss=0.25)
     place = str(tmp_path), tmp_path.as_posix()
-    assert opened == [((name, *place), {f"{name}_kwargs": {"project": "dynmap_rl"}})]
-    assert calls == [("loss", 0.5, 1), ("loss", 0.25, 2)]
+    assert [place_given for place_given, _ in opened] == [(name, *place)]
+    options = opened[0][1][f"{name}_kwargs"]
+    assert options.pop("project") == "dynmap_rl"
+    if name == "wandb":
+        assert options.pop("reinit") == "create_new"
+        loggers._open.cache_clear()
+        log_metrics(tmp_path, 3, name, loss=0.5)  # a process that goes on
+        log_metrics(tmp_path / "other", 3, name, loss=0.5)
+        ids = [call[f"{name}_kwargs"]["id"] for _, call in opened]
+        assert options.pop("id") == ids[1] != ids[2]
+    assert options == {}
+    assert calls[:2] == [("loss", 0.5, 1), ("loss", 0.25, 2)]
 
 
 def test_what_is_unknown_or_not_installed_is_one_line_before_anything_is_written(tmp_path, monkeypatch):
