@@ -1,0 +1,48 @@
+"""The same command gives the same metrics, results and weights, to the last bit, for every recipe that trains; all but
+the wall-clock time."""
+
+import pytest
+from commands import place_recordings, run
+from kills import contents
+
+PPO = "--iterations 2 --checkpoint_every 1 --epochs 1 --minibatch 240 --num_envs 2 --eval_episodes 2 --final_episodes 2"
+SOURCE = "--world_model runs/decoupled/balance_reaching/none_recurrent_smoke"
+TASKS = "balance_reaching", "bin_dropping"
+RECIPES = {
+    "decoupled": "--smoke --supervision none",
+    "joint": "--smoke",
+    "end_to_end": "--smoke",
+    "generalize": f"--smoke --task bin_dropping {SOURCE}",
+    "expert": PPO,
+    "latent_ppo": f"--smoke {SOURCE}",
+}
+
+
+@pytest.fixture(scope="module")
+def twice(tmp_path_factory, recordings):
+    """Two folders, in each of which every recipe ran."""
+    folders = [tmp_path_factory.mktemp("twice") for _ in range(2)]
+    for folder in folders:
+        place_recordings(folder, recordings, *TASKS)
+        for recipe, arguments in RECIPES.items():
+            result = run(folder, recipe, *arguments.split())
+            assert result.returncode == 0, result.stderr
+    return folders
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_the_same_command_gives_the_same(twice, recipe):
+    first, second = (contents(folder / "runs" / recipe) for folder in twice)
+    assert any(name.endswith("metrics.jsonl") for name in first)
+    assert any(name.endswith(".safetensors") for name in first)
+    assert first.keys() == second.keys()
+    assert [name for name in first if first[name] != second[name]] == []
+
+
+def test_another_seed_gives_others(twice):
+    result = run(twice[0], "end_to_end", "--smoke", "--seeds", "1", "--run", "runs/other")
+    assert result.returncode == 0, result.stderr
+    first = contents(twice[0] / "runs/end_to_end")
+    other = contents(twice[0] / "runs/other")
+    [metrics] = [first[name] for name in first if name.endswith("seed_0/metrics.jsonl")]
+    assert metrics != other["seed_1/metrics.jsonl"]
