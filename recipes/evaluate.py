@@ -18,8 +18,8 @@ from dynmap_rl.runs import run_recipe
 
 @dataclass
 class Config:
-    # Run folder of ours, or balance_reaching, which ships with the package; or a pretrained_model folder of LeRobot, or
-    # its id on the Hugging Face hub.
+    # Run folder of ours, or balance_reaching, which ships with the package; or a pretrained_model folder of LeRobot. Both
+    # may be on the Hugging Face hub, named by their id.
     policy: str | None = None
     # Which of a run's policies.
     seed: int = 0

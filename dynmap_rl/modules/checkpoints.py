@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 import torch
@@ -99,8 +100,8 @@ def load_actor(run: str | Path, seed: int = 0) -> Actor:
     """World model and policy of a run as they act in its evaluation.
 
     Args:
-        run: a run folder of ``recipes/decoupled.py``, ``joint.py``, ``end_to_end.py`` or ``generalize.py``, or
-            ``"balance_reaching"``: a run of task 1 ships with the package.
+        run: a run folder of ``recipes/decoupled.py``, ``joint.py``, ``end_to_end.py`` or ``generalize.py``, its id on
+            the Hugging Face hub, or ``"balance_reaching"``: a run of task 1 ships with the package.
         seed: of the policy.
 
     Raises:
@@ -113,9 +114,20 @@ def load_actor(run: str | Path, seed: int = 0) -> Actor:
 
 
 def find_run(run: str | Path) -> Path:
-    """The folder of a run that ships with the package, by its name, or else the path itself."""
-    shipped = SHIPPED / run
-    return shipped if (shipped / "config.json").exists() else Path(run)
+    """The folder of a run: one that ships with the package, by its name, or one on the Hugging Face hub, by its id
+    (``user/name``; its JSON and safetensors are downloaded), or else the path itself."""
+    shipped, folder = SHIPPED / run, Path(run).expanduser()
+    if (shipped / "config.json").exists():
+        return shipped
+    may_be_id = isinstance(run, str) and len(folder.parts) == 2 and run[0] not in "./~"
+    if folder.exists() or not may_be_id or folder.parts[0] == "runs":  # where our recipes write to
+        return folder
+    from httpx import HTTPError
+    from huggingface_hub import snapshot_download
+
+    with suppress(OSError, ValueError, HTTPError):  # no such id, or no network
+        return Path(snapshot_download(run, allow_patterns=["*.json", "*.safetensors"]))
+    return folder
 
 
 def _read_arguments(folder: Path) -> dict:

@@ -1,4 +1,4 @@
-"""A stand-in for the Hugging Face hub on the loopback interface: as much of it as pushing and pulling a dataset takes.
+"""A stand-in for the Hugging Face hub on the loopback interface: as much of it as pushing and pulling takes.
 
 ``python stand_in_hub.py`` serves until it is ended and prints its address. Repositories live in memory. ``POST /cut`` makes
 it break off every file of more than 10 kB in the middle, ``POST /mend`` ends that.
@@ -16,6 +16,7 @@ from urllib.parse import unquote
 REPOS: dict[str, Repo] = {}
 BLOBS: dict[str, bytes] = {}  # large files by their SHA-256
 CUTTING: list[bool] = []
+LARGE = ".parquet", ".safetensors"
 
 
 class Repo:
@@ -85,13 +86,14 @@ class Handler(BaseHTTPRequestHandler):
         if match := re.fullmatch(r"/blob/(\w+)", path):
             BLOBS[match[1]] = data
             return self.answer()
-        if match := re.fullmatch(r"/datasets/([^/]+/[^/]+)\.git/info/lfs/objects/batch", path):
+        if match := re.fullmatch(r"/(?:datasets/)?([^/]+/[^/]+)\.git/info/lfs/objects/batch", path):
             objects = [
                 {**o, "actions": {"upload": {"href": f"{address}/blob/{o['oid']}"}}}
                 for o in json.loads(data)["objects"]
             ]
             return self.answer({"transfer": "basic", "objects": objects})
-        match = re.fullmatch(r"/(?:api/)?datasets/([^/]+/[^/]+)(?:/(\w+)(?:/([^/]+)(?:/(.*))?)?)?", path)
+        kinds = "(?:(?:datasets|models)/)?"
+        match = re.fullmatch(rf"/(?:api/)?{kinds}([^/]+/[^/]+)(?:/(\w+)(?:/([^/]+)(?:/(.*))?)?)?", path)
         if not match or match[1] not in REPOS:
             return self.refuse("RepoNotFound")
         repo, action, revision, rest = REPOS[match[1]], match[2], match[3] or "main", match[4]
@@ -103,7 +105,7 @@ class Handler(BaseHTTPRequestHandler):
         files = repo.commits[commit]
         if action == "preupload":
             modes = [
-                {"path": f["path"], "uploadMode": "lfs" if f["path"].endswith(".parquet") else "regular"}
+                {"path": f["path"], "uploadMode": "lfs" if f["path"].endswith(LARGE) else "regular"}
                 for f in json.loads(data)["files"]
             ]
             return self.answer({"files": [{**mode, "shouldIgnore": False} for mode in modes]})

@@ -76,6 +76,7 @@ def hub():
 
 def run(code, endpoint, home, offline="0"):
     environment = {
+        "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
         "HF_ENDPOINT": endpoint,
         "HF_TOKEN": "hf_dummy",
         "HF_HUB_DISABLE_XET": "1",
@@ -103,6 +104,35 @@ def test_push_a_pull_that_is_cut_off_pull_push_again_and_use_offline(recording, 
     assert "More Information Needed" not in card
     picture = Image.open(urllib.request.urlopen(f"{address}/picture.png"))
     assert "](picture.png)" in card and picture.size == (8 * 128, 3 * 128)
+
+
+RUN = """
+import subprocess
+from pathlib import Path
+
+import torch
+
+from dynmap_rl.modules import load_actor
+from dynmap_rl.modules.checkpoints import SHIPPED, find_run
+
+run = SHIPPED / "balance_reaching"
+command = ["hf", "upload", "someone/run", str(run), ".", "--include", "*.json", "--include", "*.safetensors"]
+if {push}:
+    subprocess.run(command, check=True)
+found = find_run("someone/run")
+assert found != Path("someone/run")
+files = [sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()) for folder in (run, found)]
+assert files[0] == files[1]
+for ours, theirs in zip(*(load_actor(name).state_dict().values() for name in (run, "someone/run"))):
+    assert torch.equal(ours, theirs)
+assert find_run("someone/else") == Path("someone/else")
+"""
+
+
+@pytest.mark.slow
+def test_a_run_folder_goes_there_and_back_and_is_found_offline(tmp_path, hub):
+    run(RUN.format(push=True), hub, tmp_path / "home")
+    run(RUN.format(push=False), hub, tmp_path / "home", offline="1")
 
 
 @pytest.mark.slow
