@@ -12,7 +12,11 @@ from dynmap_rl.evaluation.report import markdown_row, read_rows
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
-RESULTS = [p for p in sorted((ROOT / "recipes/results").glob("*.json")) if "row" in json.loads(p.read_text())]
+RESULTS = [
+    p
+    for p in sorted((ROOT / "recipes/results").glob("*.json"))
+    if "test_protocol" in json.loads(p.read_text())
+]
 
 
 def test_python_snippets_run(tmp_path, monkeypatch):
@@ -146,6 +150,18 @@ def test_ppo_on_latents_is_that_of_the_results():
         f"PPO on states in {100 * states['success']:.1f} %, {1000 * states['position_error']:.1f} mm off"
         in text
     )
+
+
+def test_errors_on_the_foreign_dataset_are_those_of_the_results():
+    facts = json.loads((ROOT / "recipes/results/gliding.json").read_text())
+    ours, constant = facts["held_out"]["position"], facts["spread"]["position"]
+    text = " ".join(README.split())
+    assert (
+        f"to {ours['x']:.3f} and {ours['y']:.3f} (of a frame's width and height; the best constant: "
+        f"{constant['x']:.3f} and {constant['y']:.3f})" in text
+    )
+    assert f"({ours['angle']:.1f} rad; the constant {constant['angle']:.2f};" in text
+    assert facts["command"] in README
 
 
 def test_what_a_world_model_knows_is_that_of_the_results():

@@ -152,19 +152,13 @@ def row_text(result: dict) -> str:
 
 
 def markdown_row(result: dict) -> str:
-    """The row of the README's table: the paper's numbers, ours by its protocol, ours on the shared start states."""
-    test = result["test_protocol"]
-    paper, ours, rate = row_cells(result)
+    """A row of the README's tables: the paper's numbers, ours by its protocol, ours on the shared start states."""
+    test, paper = result["test_protocol"], paper_numbers(result)
+    low, high = test["SR_interval"]
     others = [f"{test[name]:.1f}" for name in _metrics(result) if name != "SR"]
-    return f"| {' | '.join([f'{_label(result)}, {result["policy"]}', paper, ours, *others, rate])} |"
-
-
-def row_cells(result: dict) -> tuple[str, str, str]:
-    """The paper's numbers, ours by its protocol, and our SR on the shared start states, as text."""
-    paper, (low, high) = paper_numbers(result), result["test_protocol"]["SR_interval"]
-    ours = {name: result["paper_protocol"][name] for name in _metrics(result)}
-    rate = f"**{result['test_protocol']['SR']:.1f}** [{low:.1f}, {high:.1f}]"
-    return _short(paper) if paper else "-", _short(ours), rate
+    ours = _short({name: result["paper_protocol"][name] for name in _metrics(result)})
+    rate = f"**{test['SR']:.1f}** [{low:.1f}, {high:.1f}]"
+    return f"| {' | '.join([result['row'], _short(paper) if paper else '-', ours, *others, rate])} |"
 
 
 def _title(result: dict) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 from dynmap_rl.runs import read_json
 
 from .paper import METRICS, TABLES, paper_numbers
-from .report import row_cells
+from .report import markdown_row
 
 COLUMNS = {  # table: its columns, as (task, training, policy)
     "I": [key for key in TABLES if key[0] == "balance_reaching"],
@@ -62,20 +62,42 @@ def table_rows(results: Path) -> list[dict]:
     return rows
 
 
-def markdown_table(results: Path, table: str) -> str:
-    """One table: in every column the paper's numbers, ours by its protocol, and SR on the 1,000 shared starts."""
-    cells, columns = read_cells(results), COLUMNS[table]
-    metrics = [name for name in METRICS[columns[0][0]] if name != "SR"]
-    what = "SR (std)" + (f"; {', '.join(metrics)}" if metrics else "")
-    head = ["", *(f"{t}, {p}: paper, {what} | here, {what} | here, SR of 3,000" for _, t, p in columns)]
-    lines = [head, ["---"] * (1 + 3 * len(columns))]
+def markdown_overview(results: Path) -> str:
+    """SR (%) of all three tables in one: the paper's, and ours on the 1,000 shared starts."""
+    cells = read_cells(results)
+    columns = [(table, column) for table, columns in COLUMNS.items() for column in columns]
+    lines = [
+        ["", *(f"{table}: {', '.join(column[1:])}" for table, column in columns)],
+        ["---"] * (1 + len(columns)),
+    ]
     for row in ROWS:
-        found = [cells.get((*column, row)) for column in columns]
-        if any(found):
-            lines.append(
-                [row, *(" | ".join(row_cells(result)) if result else "- | - | -" for result in found)]
-            )
+        line = [row]
+        for _, column in columns:
+            paper, result = TABLES[column].get(row), cells.get((*column, row))
+            ours = f"**{result['test_protocol']['SR']:.1f}**" if result else "-"
+            line.append(f"{paper[-1][0]} / {ours}" if paper else "")
+        lines.append(line)
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def markdown_table(results: Path, column: tuple[str, str, str]) -> str:
+    """One column of a table, with all metrics: the paper's numbers, ours by its protocol of 50 episodes, and ours on the
+    1,000 shared starts."""
+    cells, metrics = read_cells(results), [name for name in METRICS[column[0]] if name != "SR"]
+    what = "SR (std)" + (f"; {', '.join(metrics)}" if metrics else "")
+    head = ["", f"paper: {what}", f"here, paper's protocol: {what}", *metrics, "SR, same 1,000 starts"]
+    found = [cells[*column, row] for row in ROWS if (*column, row) in cells]
+    lines = [f"| {' | '.join(line)} |" for line in (head, ["---"] * len(head))]
+    return "\n".join([*lines, *map(markdown_row, found)])
+
+
+def markdown_tables(results: Path) -> str:
+    """The overview, and every column of the three tables under its name."""
+    parts = [f"SR in %, the paper's / ours on the 1,000 shared starts\n\n{markdown_overview(results)}"]
+    for table, columns in COLUMNS.items():
+        for column in columns:
+            parts.append(f"Table {table}, {', '.join(column[1:])}\n\n{markdown_table(results, column)}")
+    return "\n\n".join(parts)
 
 
 def print_tables(results: Path, form: str) -> None:
@@ -87,6 +109,6 @@ def print_tables(results: Path, form: str) -> None:
     elif form == "findings":
         print(markdown_findings(results))
     elif form == "markdown":
-        print("\n\n".join(f"Table {table}\n\n{markdown_table(results, table)}" for table in COLUMNS))
+        print(markdown_tables(results))
     else:
         raise ValueError(f"--print is markdown, json or findings, not {form!r}")
