@@ -137,6 +137,16 @@ def test_memory_is_that_of_the_results():
     assert f"`joint` and `end_to_end` {peak['joint']:.1f}" in text
 
 
+def test_the_soak_is_that_of_the_results():
+    facts = json.loads((ROOT / "recipes/results/soak.json").read_text())
+    text, held = " ".join(README.split()), facts["held_mb"]
+    assert facts["steps"] == 1_000_000
+    said = (
+        f"{facts['episodes']:,} episodes, hold {held[-1]} MB at the end and {held[0]} after the first tenth"
+    )
+    assert f"A million control steps with frames, {said}" in text
+
+
 def test_ppo_on_latents_is_that_of_the_results():
     facts = json.loads((ROOT / "recipes/results/latent_ppo_balance_reaching.json").read_text())
     latents, states = facts["latents"], facts["states"]
