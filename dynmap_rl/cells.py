@@ -24,10 +24,12 @@ class Cell:
 
     @property
     def task(self) -> str:
+        """That the cell's policies are judged on."""
         return self.arguments[self.arguments.index("--task") + 1] if "--task" in self.arguments else TASKS[0]
 
     @property
     def minutes(self) -> int:
+        """About how long it takes on two cores."""
         return MINUTES["reuse" if self.recipe == "decoupled" and self.needs else self.recipe]
 
 

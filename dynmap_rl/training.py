@@ -238,6 +238,7 @@ def fingerprint(module: nn.Module) -> str:
 
 
 def make_optimizer(module: nn.Module, learning_rate: float, weight_decay: float) -> torch.optim.Optimizer:
+    """AdamW as all our trainings have it."""
     return torch.optim.AdamW(
         module.parameters(), learning_rate, betas=(0.9, 0.99), weight_decay=weight_decay, fused=True
     )

@@ -16,6 +16,7 @@ MARGIN = 0.03  # m, between the obstacle and the largest cart and block
 
 
 def square(x: float, y: float, side: float) -> Polygon:
+    """The corners of an upright square around a point (m)."""
     half = side / 2
     return [(x - half, y - half), (x + half, y - half), (x + half, y + half), (x - half, y + half)]
 
@@ -73,6 +74,7 @@ def keep_out(scene: ObstacleScene) -> tuple[Point, Point]:
 
 
 def is_inside(point: Point, low: Point, high: Point) -> bool:
+    """Whether the point lies within the rectangle, its edge left out."""
     return low[0] < point[0] < high[0] and low[1] < point[1] < high[1]
 
 
@@ -96,10 +98,12 @@ def way_around(scene: ObstacleScene, start: Point, goal: Point) -> list[Point]:
 
 
 def way_from_start(scene: ObstacleScene) -> list[Point]:
+    """The same from where the scene's cart starts to its goal."""
     return way_around(scene, (scene.cart_x, scene.cart_y), (scene.goal_x, scene.goal_y))
 
 
 def length(way: list[Point]) -> float:
+    """Of a way through points (m)."""
     return sum(map(math.dist, way, way[1:]))
 
 

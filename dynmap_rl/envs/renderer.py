@@ -82,6 +82,7 @@ class Window:
         self.clock.tick(self.fps)
 
     def close(self) -> None:
+        """Close the window."""
         pygame.display.quit()
 
 

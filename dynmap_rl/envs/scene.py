@@ -48,10 +48,12 @@ class Scene:
             raise ValueError(f"scene: block_shift {self.block_shift} puts the block's centre beside the cart")
 
     def to_dict(self) -> dict:
+        """All factors by their names, for JSON."""
         return asdict(self)
 
     @classmethod
     def from_dict(cls, values: Mapping) -> Scene:
+        """A scene from its factors by name; the others have their defaults."""
         return cls().replace(**values)
 
     def replace(self, **values) -> Scene:

@@ -61,9 +61,11 @@ class BalanceReaching:
     pushes = 6  # in a disturbed demonstration, which shows how to recover from them
 
     def sample_scene(self, rng: np.random.Generator, ranges: SceneRanges | None = None) -> Scene:
+        """Draw a scene, from ``ranges`` of one's own or from the task's."""
         return sample_scene(rng, ranges or self.ranges)
 
     def make_world(self, scene: Scene) -> World:
+        """The physics of a scene at its start."""
         return World(scene)
 
     def goal(self, world: World) -> np.ndarray:
@@ -103,6 +105,7 @@ class BalanceReaching:
         return clipped(values)
 
     def reward(self, world: World) -> float:
+        """Of the step that led to the world as it is."""
         if world.dropped:
             return 0.0
         d = world.goal_distance
@@ -117,6 +120,7 @@ class BalanceReaching:
         return world.dropped
 
     def is_success(self, world: World) -> bool:
+        """Whether the episode, as it stands, is one; asked at its end."""
         return world.steps >= EPISODE_STEPS and not world.dropped and world.position_error < SUCCESS_DISTANCE
 
     def markers(self, scene: Scene) -> list[tuple[Polygon, Color]]:
@@ -166,6 +170,7 @@ class BalanceReachingObstacle(BalanceReaching):
         return np.concatenate([state, np.array([*obstacle, 2 * length(way)], dtype=np.float32)])
 
     def way(self, world: World, start: Point) -> list[Point]:
+        """The shortest way around the obstacle from a point to the goal."""
         return way_around(world.scene, start, tuple(world.goal.tolist()))
 
     def reward(self, world: World) -> float:

@@ -106,5 +106,6 @@ def load_expert(expert: str | Path, checkpoint: str | None = None) -> ExpertNetw
 
 
 def find_expert(expert: str | Path) -> Path:
+    """The folder of an expert's checkpoints: one that ships with the package, by its name, or the path itself."""
     shipped = CHECKPOINTS / expert
     return shipped if shipped.is_dir() else Path(expert)

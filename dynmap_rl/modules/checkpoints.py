@@ -44,6 +44,7 @@ def check_policy(kind: str) -> None:
 
 
 def save_world_model(folder: Path, model: WorldModel) -> None:
+    """Write its weights, and its sizes as ``arguments.json``."""
     arguments = {
         "action": model.transition.action.size,
         "dynamics": {q: n.size for q, n in model.dynamics_decoder.normalizers.items()},
@@ -69,6 +70,7 @@ def load_world_model(folder: Path) -> WorldModel:
 
 
 def save_policy(folder: Path, policy: FeedforwardPolicy | RecurrentPolicy, world_model: WorldModel) -> None:
+    """Write its weights, and its kind and sizes as ``arguments.json``; the world model is the one that it acts on."""
     recurrent = isinstance(policy, RecurrentPolicy)
     arguments = {
         "kind": "recurrent" if recurrent else "feedforward",

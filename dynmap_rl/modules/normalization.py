@@ -23,10 +23,13 @@ class Normalizer(nn.Module):
 
     @property
     def size(self) -> int:
+        """D."""
         return self.center.numel()
 
     def normalize(self, x: torch.Tensor) -> torch.Tensor:
+        """``[..., D]`` in SI units to [-1, 1]."""
         return (x - self.center) / self.scale
 
     def denormalize(self, x: torch.Tensor) -> torch.Tensor:
+        """``[..., D]`` in [-1, 1] to SI units."""
         return x * self.scale + self.center

@@ -44,6 +44,7 @@ class TwoLSTM(nn.Module):
         return tuple(s.reshape(*x.shape[:-1], -1) for s in after)
 
     def initial_state(self, batch: int, device=None) -> State:
+        """The state at the start of B episodes: four zero tensors ``[B, H]``."""
         return tuple(torch.zeros(batch, self.hidden_size, device=device) for _ in range(4))
 
 

@@ -160,6 +160,7 @@ class Actor(TensorDictModuleBase):
 
     @property
     def policy(self) -> FeedforwardPolicy | RecurrentPolicy:
+        """The policy without its TensorDict adapter."""
         return self.latent_actor.policy
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

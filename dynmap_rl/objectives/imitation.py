@@ -84,6 +84,7 @@ class ImitationLoss(LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
+        """What the loss reads, as ``set_keys`` names it."""
         keys = self.tensor_keys
         return [unravel_key(k) for k in (keys.latent, keys.hidden1, keys.hidden2, keys.goal, keys.action)]
 

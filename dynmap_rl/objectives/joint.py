@@ -72,11 +72,13 @@ class JointLoss(LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
+        """What the loss reads, as ``set_keys`` of it and of the world model's loss name it."""
         keys = self.world_model_loss.in_keys
         return [*(keys[:2] if self.end_to_end else keys), unravel_key(self.tensor_keys.goal)]
 
     @property
     def out_keys(self) -> list[str]:
+        """The losses, to be added up."""
         return [*([] if self.end_to_end else self.world_model_loss.out_keys), "loss_policy"]
 
     @dispatch

@@ -63,12 +63,14 @@ class WorldModelLoss(LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
+        """What the loss reads, as ``set_keys`` names it; only the dynamics that the world model decodes."""
         keys = self.tensor_keys
         dynamics = [(keys.dynamics, quantity) for quantity in self.world_model.supervision]
         return [unravel_key(key) for key in (keys.pixels, keys.action, *dynamics)]
 
     @property
     def out_keys(self) -> list[str]:
+        """The losses, to be added up."""
         return [f"loss_{name}" for name in ("rgb", "latent", *self.world_model.supervision)]
 
     @dispatch

@@ -90,14 +90,17 @@ class Session:
 
     @property
     def world(self):
+        """The simulated one."""
         return self.env.worlds[0]
 
     @property
     def over(self) -> bool:
+        """Whether the episode's steps have passed."""
         return self.world.steps >= EPISODE_STEPS
 
     @property
     def succeeded(self) -> bool:
+        """Whether the episode, as it stands, is a success."""
         return self.env.task.is_success(self.world)
 
     def restart(self, seed: int | None = None) -> None:

@@ -62,6 +62,7 @@ class PlayWindow:
         self.renderer = Renderer(size, supersample=2)
 
     def close(self) -> None:
+        """Close the window."""
         pygame.display.quit()
 
     def handle(self) -> None:
