@@ -36,6 +36,8 @@ class Config:
     scene: int = 0
     # Folder of a LeRobot dataset for your demonstrations.
     record: Path | None = None
+    # Id on the Hugging Face hub (user/name) to upload that dataset to, at the end.
+    push_to_hub: str | None = None
     # Side of the scene on the screen, in pixels.
     size: int = 384
     # End after so many steps (for films); and an animation of the window as a GIF.
@@ -44,6 +46,7 @@ class Config:
 
 
 def main(config: Config) -> None:
+    from dynmap_rl.data import push_dataset
     from dynmap_rl.data.human import list_shards, open_folder, publish_episodes
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.envs.world import CONTROL_DT
@@ -60,6 +63,8 @@ def main(config: Config) -> None:
         raise ValueError("--size must be at least 64 and --steps at least 1")
     if config.gif and not config.steps:
         raise ValueError("--gif needs --steps, the number of steps that the film shows")
+    if config.push_to_hub and not config.record:
+        raise ValueError("--push_to_hub needs --record, the folder of the demonstrations")
     kept = 0
     if config.record:
         open_folder(config.record, task)
@@ -80,6 +85,9 @@ def main(config: Config) -> None:
         count = len(list_shards(config.record, task)) if config.record else 0
         if count > max(kept, 1) or (count > 1 and not config.record.exists()):
             print(f"{count} episodes: {publish_episodes(config.record, task)}")
+    if config.push_to_hub:
+        push_dataset(config.record, config.push_to_hub)
+        print(f"pushed: {config.push_to_hub}")
     if config.gif:
         save_film(frames, config.gif)
 

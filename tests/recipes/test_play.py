@@ -1,6 +1,7 @@
 """The play recipe, without a display: what keys and mouse do, what is recorded."""
 
 import shutil
+from pathlib import Path
 
 import pytest
 from commands import run
@@ -82,9 +83,12 @@ def test_a_policy_is_watched_and_filmed(trained, tmp_path):
 def test_what_a_person_drove_becomes_a_dataset(tmp_path, monkeypatch):
     """Here the person does what the expert would."""
     monkeypatch.setattr(session.Session, "_hand_action", session.Session._expert_action)
+    pushed = []
+    monkeypatch.setattr("dynmap_rl.data.push_dataset", lambda *arguments: pushed.append(arguments))
     arguments = "--driver", "hand", "--record", "mine", "--steps", 141 + 120, "--size", 64
-    result = run(tmp_path, "play", *arguments)
+    result = run(tmp_path, "play", *arguments, "--push_to_hub", "someone/mine")
     assert result.returncode == 0, result.stderr
+    assert pushed == [(Path("mine"), "someone/mine")] and "pushed: someone/mine" in result.stdout
     assert "kept: 2 episodes in mine.parts" in result.stdout and "2 episodes: mine" in result.stdout
     assert load_dataset(tmp_path / "mine").shape == (2, 120)
     meta = load_meta(tmp_path / "mine")
@@ -142,6 +146,7 @@ def test_without_a_display_there_is_one_clear_line(tmp_path, monkeypatch):
         (["--task", "juggling"], "unknown task"),
         (["--steps", "0"], "--steps at least 1"),
         (["--gif", "film.gif"], "--gif needs --steps"),
+        (["--push_to_hub", "someone/mine"], "--push_to_hub needs --record"),
         (["--expert", "bin_dropping"], "sees states of bin_dropping, which balance_reaching does not have"),
         (["--driver", "policy"], "--driver is one of hand, expert, not 'policy'"),
         (["--policy", "nothing"], "no checkpoint"),
