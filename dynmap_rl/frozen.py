@@ -74,6 +74,7 @@ def train_policies(
             world_model, episodes["train"], settings.copies, generator, recolor=recolor
         )
         held_out = data.compute_features(world_model, episodes["eval"])
+        shutil.rmtree(folder / "features", ignore_errors=True)  # of a killed run
         check_space(folder, features.bytes() + held_out.bytes())
         try:
             for name, values in (("train", features), ("eval", held_out)):

@@ -35,6 +35,7 @@ HINTS = {
         (errno.ENOSPC, errno.EDQUOT, errno.EFBIG), "make room; the same command goes on where it was"
     ),
     **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "choose a folder that can be written to"),
+    **dict.fromkeys((errno.EEXIST, errno.ENOTDIR, errno.EISDIR), "choose another path"),
 }
 LOCKS = {}  # of this process's folders: released when nothing refers to them
 
@@ -45,10 +46,11 @@ def write_json(path: Path, value) -> None:
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write under a temporary name, then rename: the file is whole or as it was, and nothing else is left."""
+    """Write under a temporary name, then rename: the file is whole or as it was, and nothing else is left (but by a
+    kill, whose leftovers the next write of the same file removes)."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary = path.with_name(f".{path.name}.tmp")
     try:
         temporary.write_bytes(data)
         temporary.replace(path)
@@ -60,10 +62,10 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def read_json(path: Path):
-    """Raises ``ValueError`` with the file's name where it is not valid JSON."""
+    """Raises ``ValueError`` with the file's name where it is not valid JSON, or not a file of UTF-8."""
     try:
         return json.loads(Path(path).read_text())
-    except json.JSONDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not valid JSON ({error}); delete it or restore it") from error
 
 
@@ -122,6 +124,13 @@ def replace_defaults(config, values: dict) -> None:
             setattr(config, name, value)
 
 
+def check_at_least_one(config, *names: str) -> None:
+    """Raises ``ValueError`` for one of these settings that is below 1; those that there are not do not matter."""
+    for name in names:
+        if (value := getattr(config, name, 1)) < 1:
+            raise ValueError(f"--{name} must be at least 1, not {value}")
+
+
 def append_metrics(folder: Path, step: int, **metrics: float) -> None:
     """Append one line to ``metrics.jsonl``."""
     line = json.dumps({"step": step, **{k: _plain(v) for k, v in metrics.items()}})
@@ -175,7 +184,7 @@ def load_training_state(path: Path) -> dict | None:
     if not Path(path).exists():
         return None
     try:
-        state = torch.load(path, weights_only=True)
+        state = torch.load(path, map_location="cpu", weights_only=True)
         torch.set_rng_state(state.pop("rng"))
     except Exception as error:
         raise ValueError(f"{path} cannot be read ({error}); delete it to train from the start") from error

@@ -48,9 +48,8 @@ def check_settings(settings) -> list[int]:
         raise ValueError(f"--split is test or validation, not {settings.split!r}")
     if settings.test_episodes > SHARED_STARTS:
         raise ValueError(f"there are {SHARED_STARTS} shared start states, not {settings.test_episodes}")
-    for name in ("updates", "policy_updates", "test_episodes", "paper_episodes"):
-        if (value := getattr(settings, name, 1)) < 1:
-            raise ValueError(f"--{name} must be at least 1, not {value}")
+    numbers = "updates", "windows", "rgb_steps", "policy_updates", "policy_batch", "threads"
+    runs.check_at_least_one(settings, *numbers, "test_episodes", "paper_episodes")
     if not 2 <= (steps := getattr(settings, "window_steps", 2)) <= EPISODE_STEPS:
         raise ValueError(f"--window_steps must be 2 to {EPISODE_STEPS}, not {steps}")
     if foreign:

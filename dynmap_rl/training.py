@@ -19,7 +19,7 @@ from dynmap_rl.loggers import log_metrics
 from dynmap_rl.modules import WorldModel, mixed_precision
 from dynmap_rl.objectives import ImitationLoss, JointLoss, WorldModelLoss
 
-ADVICE = "the last training state before is kept; run again with a lower learning rate, in another --run"
+ADVICE = "what was kept before stays; run again with a lower learning rate, in another --run"
 GROUPS = {"": [0, 1, 3, 4], "_angle": [2, 5]}  # entries of our tasks' dynamics that have one unit
 
 
@@ -130,7 +130,10 @@ def _fit(
     if state := runs.load_training_state(path):
         model.load_state_dict(state["model"])
         optimizer.load_state_dict(state["optimizer"])
-        generator.set_state(state["generator"].cpu())
+        if state["generator"].shape == generator.get_state().shape:
+            generator.set_state(state["generator"])
+        else:  # it was on another kind of device
+            generator.manual_seed(seed + state["update"])
         start, first = state["update"], state.get("first_loss")
     runs.truncate_metrics(folder, start)
     progress = tqdm(range(start, settings.updates), folder.name, settings.updates, initial=start)
@@ -193,7 +196,7 @@ def train_policy(
         if done % 100 == 0 or done == settings.policy_updates:
             with torch.no_grad():
                 validation = plain(held_out)["loss_policy"]
-            log_metrics(folder, done, settings.logger, loss=loss, held_out_loss=validation)
+            log_metrics(folder, done, settings.logger, loss=loss.item(), held_out_loss=validation)
             progress.set_postfix(loss=f"{loss:.4f}", held_out=f"{validation:.4f}")
 
 

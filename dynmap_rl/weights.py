@@ -1,4 +1,5 @@
-"""The weights of modules as safetensors: files from strangers run no code and take no more memory than their size."""
+"""The weights of modules as safetensors: files from strangers run no code, and take memory in
+proportion to their size."""
 
 from __future__ import annotations
 
@@ -39,6 +40,8 @@ def load_module[Module: nn.Module](path: Path, make: Callable[[], Module]) -> Mo
             raise ValueError(f"other names or shapes, such as {differing[0]}")
         module = make()
         module.load_state_dict(load_file(path))
+    except OSError:
+        raise
     except Exception as error:  # of torch for impossible sizes, of safetensors for damaged files
         raise ValueError(f"{path} does not hold this model's weights: {error}") from error
     return module

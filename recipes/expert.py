@@ -49,10 +49,11 @@ def main(config: Config) -> None:
     from dynmap_rl.envs.world import ACCELERATION_LIMIT
     from dynmap_rl.evaluation import write_html
     from dynmap_rl.experts import ExpertNetwork, list_checkpoints, roll_out
-    from dynmap_rl.experts.ppo import fresh_scenes, rates, train_ppo
+    from dynmap_rl.experts.ppo import POSITIVE, fresh_scenes, rates, train_ppo
     from dynmap_rl.loggers import check_logger
 
     check_logger(config.logger)
+    runs.check_at_least_one(config, *POSITIVE)
     torch.set_num_threads(config.threads)
     env = DynmapBatchedEnv(config.task, config.num_envs, control="acceleration")
     folder = runs.open_run(

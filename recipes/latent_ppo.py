@@ -64,7 +64,7 @@ def main(config: Config) -> None:
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.envs.world import ACCELERATION_LIMIT
     from dynmap_rl.evaluation import write_html
-    from dynmap_rl.experts.ppo import fresh_scenes, rates, train_ppo
+    from dynmap_rl.experts.ppo import POSITIVE, fresh_scenes, rates, train_ppo
     from dynmap_rl.loggers import check_logger
     from dynmap_rl.training import fingerprint
 
@@ -75,6 +75,7 @@ def main(config: Config) -> None:
             "--world_model is the run folder of a world model; train one with recipes/decoupled.py"
         )
     check_logger(config.logger)
+    runs.check_at_least_one(config, *POSITIVE)
     task = get_task(config.task)
     world_model, source = frozen.load_source(config.world_model)
     world_model.requires_grad_(False)

@@ -24,8 +24,8 @@ class Config:
     # Name of the task: balance_reaching, balance_reaching_obstacle, bin_dropping, or module:Class of your own; by
     # default the one that the policy was trained on, otherwise balance_reaching.
     task: str | None = None
-    # Run folder of ours with world model and policy, or balance_reaching, which ships with the package; and which of
-    # its policies.
+    # Run folder of ours with world model and policy, its id on the hub, or balance_reaching, which ships with the
+    # package; and which of its policies.
     policy: str | None = None
     seed: int = 0
     # Expert: the name of the task that it ships for, or a folder of checkpoints; by default the task's own.
@@ -48,16 +48,20 @@ class Config:
 def main(config: Config) -> None:
     from dynmap_rl.data import push_dataset
     from dynmap_rl.data.human import list_shards, open_folder, publish_episodes
-    from dynmap_rl.envs.tasks import get_task
+    from dynmap_rl.envs.tasks import get_task, stored_task
     from dynmap_rl.envs.world import CONTROL_DT
     from dynmap_rl.modules import find_run, load_actor
     from dynmap_rl.play import PlayWindow, Session
     from dynmap_rl.runs import read_json
 
-    actor = load_actor(config.policy, config.seed) if config.policy else None
-    facts = find_run(config.policy) / "config.json" if config.policy else None
-    trained_on = read_json(facts).get("task") if facts and facts.exists() else None
-    task = config.task or trained_on or "balance_reaching"
+    task, actor = config.task, None
+    if config.policy:
+        run = find_run(config.policy)
+        actor = load_actor(run, config.seed)
+        if not task and (run / "config.json").exists():
+            task = read_json(run / "config.json").get("task")
+            stored_task(task)
+    task = task or "balance_reaching"
     get_task(task)
     if config.size < 64 or (config.steps is not None and config.steps < 1):
         raise ValueError("--size must be at least 64 and --steps at least 1")
@@ -85,11 +89,15 @@ def main(config: Config) -> None:
         count = len(list_shards(config.record, task)) if config.record else 0
         if count > max(kept, 1) or (count > 1 and not config.record.exists()):
             print(f"{count} episodes: {publish_episodes(config.record, task)}")
-    if config.push_to_hub:
-        push_dataset(config.record, config.push_to_hub)
-        print(f"pushed: {config.push_to_hub}")
     if config.gif:
         save_film(frames, config.gif)
+    if config.push_to_hub:
+        if not config.record.exists():
+            raise ValueError(
+                f"{config.record} needs two episodes at least to be a dataset, and to be uploaded"
+            )
+        push_dataset(config.record, config.push_to_hub)
+        print(f"pushed: {config.push_to_hub}")
 
 
 def play(config: Config, task: str, session, window, frames: list, dt: float) -> None:

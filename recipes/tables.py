@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dynmap_rl.cells import Cell, list_cells
-from dynmap_rl.runs import run_recipe
+from dynmap_rl.runs import check_at_least_one, run_recipe
 
 RECIPES = Path(__file__).parent
 
@@ -59,8 +59,8 @@ def run_cell(cell: Cell, config: Config, root: Path) -> str | None:
     log.parent.mkdir(parents=True, exist_ok=True)
     with open(log, "a") as file:
         if subprocess.run(command, cwd=root, stdout=file, stderr=file).returncode:
-            said = log.read_text().splitlines()[-1:]
-            return f"{cell.name} failed; see {config.runs / cell.name}.log, which ends with {said}"
+            said = (log.read_text(errors="replace").splitlines() or ["nothing"])[-1]
+            return f"{cell.name} failed; see {config.runs / cell.name}.log, which ends with: {said}"
     write_json(root / config.results / f"{cell.name}.json", read_json(root / folder / "eval.json"))
     return None
 
@@ -115,6 +115,7 @@ def main(config: Config) -> None:
         from dynmap_rl.evaluation.tables import print_tables
 
         return print_tables(config.results, config.print)
+    check_at_least_one(config, "workers")
     if config.launcher not in LAUNCHERS:
         raise ValueError(f"--launcher is {' or '.join(LAUNCHERS)}, not {config.launcher!r}")
     cells = [cell for cell in list_cells() if config.only in cell.name]

@@ -54,7 +54,16 @@ def main(path: str, picture: str) -> None:
     view.resize(1000, 1600)
 
     def look(loaded: bool) -> None:
-        page.runJavaScript(LOOK, 0, lambda found: QTimer.singleShot(500, lambda: finish(loaded, found)))
+        page.runJavaScript(LOOK, 0, lambda found: wait(loaded, found, 40))
+
+    def wait(loaded: bool, found: str, times: int) -> None:
+        """Until something is painted; then the whole window is a moment later."""
+        shown = view.grab().toImage()
+        blank = all(shown.pixel(x, 40) == shown.pixel(0, 0) for x in range(0, shown.width(), 5))
+        if times and blank:
+            QTimer.singleShot(500, lambda: wait(loaded, found, times - 1))
+        else:
+            QTimer.singleShot(1500, lambda: finish(loaded, found))
 
     def finish(loaded: bool, found: str) -> None:
         view.grab().save(picture)

@@ -12,13 +12,13 @@ import argparse
 import ctypes
 import gc
 import json
+import resource
 import sys
 import time
 from pathlib import Path
 
 import gymnasium
 import numpy as np
-import psutil
 
 import dynmap_rl  # noqa: F401 (the ids)
 
@@ -60,7 +60,9 @@ def soak(steps: int) -> dict:
 
 
 def memory() -> float:
-    return round(psutil.Process().memory_info().rss / 1e6, 1)
+    """Resident (MB), as Linux tells it."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return round(pages * resource.getpagesize() / 1e6, 1)
 
 
 def main() -> None:

@@ -21,12 +21,14 @@ def undocumented(module):
         own = getattr(item, "__module__", None) == module.__name__
         if name.startswith("_") or not own or not (inspect.isclass(item) or inspect.isfunction(item)):
             continue
-        if not inspect.getdoc(item):
+        said = vars(item).get("__doc__") if inspect.isclass(item) else item.__doc__
+        if not said or said.startswith(f"{name}("):  # which a dataclass says of itself
             yield name
         if inspect.isclass(item) and not module.__name__.startswith(THEIRS):
             for member, value in vars(item).items():
+                kinds = property | classmethod | staticmethod
                 public = not member.startswith("_") and (
-                    inspect.isfunction(value) or isinstance(value, property)
+                    inspect.isfunction(value) or isinstance(value, kinds)
                 )
                 if public and member != "forward" and not inspect.getdoc(getattr(item, member)):
                     yield f"{name}.{member}"

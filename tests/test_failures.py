@@ -23,6 +23,7 @@ import pytest
 from commands import run
 from safetensors.torch import load_file, save_file
 
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits and folders of Linux' kernel")
 RECIPES = Path(__file__).parents[1] / "recipes"
 DATA, RUN = "datasets/mine", "runs/mine"
 TRAIN = f"decoupled --smoke --dataset {DATA} --run runs/new"
@@ -150,7 +151,7 @@ CASES = [
         r"other settings \(beta_z: 0.1 there",
     ),
     (nothing, f"{EVALUATE} --seed 3", "holds no checkpoint"),
-    (nothing, "evaluate --policy runs/none", "runs/none holds no policy"),
+    (nothing, "evaluate --policy runs/none", "no policy at runs/none; train one with"),
     (
         nothing,
         "evaluate --expert bin_dropping",
@@ -160,28 +161,40 @@ CASES = [
     (nothing, f"{TRAIN} --task none --world_model {RUN}", "for another task use recipes/generalize.py"),
     # Options.
     (nothing, f"{TRAIN} --bogus 1", "unrecognized arguments: --bogus 1"),
-    (nothing, f"{TRAIN} --updates many", "updates"),
+    (nothing, f"{TRAIN} --updates many", "Couldn.t parse .many. into an int|updates.*int"),
     (nothing, f"{TRAIN} --supervision speed", "unknown supervision"),
     (nothing, f"{TRAIN} --task juggling", "unknown task"),
     (nothing, f"{TRAIN} --policy transformer", "unknown policy"),
     (nothing, f"{TRAIN} --seeds a", "whole numbers"),
     (nothing, f"{TRAIN} --device tpu", "--device is auto, cpu or cuda"),
     (nothing, f"{TRAIN} --logger paper", "--logger is one of"),
-    (nothing, f"{TRAIN} --logger trackio", "--logger trackio needs it: pip install trackio"),
     (nothing, "tables --launcher slurm", "--launcher is local or ray"),
     (nothing, "tables --only nothing", "no cell's name holds 'nothing'; --dry_run lists them"),
-    (nothing, "tables --print pdf", "markdown"),
-    (nothing, "figures --only fig99", "fig99"),
+    (nothing, "tables --print pdf", "--print is markdown, json or findings, not .pdf."),
+    (nothing, "figures --only fig99", "no figure fig99; choose from fig2"),
     (nothing, "play --driver nobody", "--driver is one of"),
-    (nothing, "expert --num_envs 0", "num_envs"),
-    (nothing, "collect --episodes 0", "at least"),
+    (nothing, "expert --num_envs 0", "num_envs must be at least 1"),
+    (nothing, "collect --episodes 0", "needs at least one episode of each split"),
+    (nothing, f"{TRAIN} --threads 0", "--threads must be at least 1"),
+    (nothing, "expert --epochs 0", "--epochs must be at least 1"),
+    (nothing, "tables --dry_run --workers 0", "--workers must be at least 1"),
+    (lambda p: change_json(p / RUN / "config.json", task="os:abort"), EVALUATE, "do so with --task os:abort"),
+    (
+        lambda p: change_json(p / RUN / "config.json", task="os:abort"),
+        f"play --policy {RUN}",
+        "do so with --task",
+    ),
     # Folders.
     (nothing, f"{TRAIN} --run /sys/run", "/sys/run.*; choose a folder that can be written to"),
     (nothing, "collect --output /sys/data", "/sys/data.*may the folder be written"),
     (nothing, f"{EVALUATE} --output /sys/result.json", "/sys/result.json.*; choose a folder that can be"),
-    (nothing, f"{TRAIN} --run {DATA}/meta/info.json", "info.json"),
+    (nothing, f"{TRAIN} --run {DATA}/meta/info.json", "info.json.; choose another path"),
     # Training.
-    (nothing, f"{TRAIN} --updates 100 --learning_rate 1e9", "with a lower learning rate, in another --run"),
+    (
+        nothing,
+        f"{TRAIN} --updates 100 --learning_rate 1e9",
+        "run again with a lower learning rate, in another --run",
+    ),
 ]
 
 

@@ -167,9 +167,7 @@ def train_from(update, change, folder, monkeypatch, **settings):
 
     monkeypatch.setattr(training, "sample_windows", sample)
     episodes = dict.fromkeys(("train", "eval"), make_episodes())
-    with pytest.raises(
-        ValueError, match="last training state before is kept; run again with a lower"
-    ) as error:
+    with pytest.raises(ValueError, match="what was kept before stays; run again with a lower") as error:
         train_world_model(
             make_model(), episodes, folder, SimpleNamespace(**{**vars(SETTINGS), **settings}), save_every=50
         )

@@ -1,7 +1,6 @@
 """Weights are read whole or not at all, and what a file says is not believed before it is checked."""
 
 import json
-import resource
 import subprocess
 import sys
 
@@ -10,7 +9,7 @@ import torch
 from safetensors.torch import save_file
 from torch import nn
 
-from dynmap_rl.modules import load_policy, load_world_model
+from dynmap_rl.modules import WorldModel, checkpoints, load_policy, load_world_model
 from dynmap_rl.modules.checkpoints import SHIPPED
 from dynmap_rl.weights import load_module, save_weights
 
@@ -63,6 +62,7 @@ def copies(tmp_path):
 @pytest.mark.parametrize(
     "arguments",
     [
+        {"hidden_size": 500},
         {"hidden_size": 10**6},
         {"hidden_size": 10**18},
         {"latent_size": -1},
@@ -73,12 +73,21 @@ def copies(tmp_path):
         {"unknown": 1},
     ],
 )
-def test_arguments_that_lie_are_refused_before_memory_is_taken(copies, arguments):
-    folder = copies("world_model", **arguments)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+def test_arguments_that_lie_are_refused_before_memory_is_taken(copies, monkeypatch, arguments):
+    """Only a module without memory is made, on the meta device."""
+    folder, made = copies("world_model", **arguments), []
+
+    def make(**arguments):
+        made.append(torch.empty(0).device.type)
+        return WorldModel(**arguments)
+
+    monkeypatch.setattr(checkpoints, "WorldModel", make)
     with pytest.raises(ValueError, match="weights.safetensors does not hold this model's weights"):
         load_world_model(folder)
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # kB
+    assert made in ([], ["meta"])
+    made.clear()
+    load_world_model(RUN / "world_model")
+    assert made == ["meta", "cpu"]
 
 
 @pytest.mark.parametrize(
@@ -87,6 +96,7 @@ def test_arguments_that_lie_are_refused_before_memory_is_taken(copies, arguments
         ({"width": 10**9}, "does not hold this model's weights"),
         ({"goal": None}, "does not hold this model's weights"),
         ({"kind": "os.system"}, "unknown policy 'os.system'"),
+        ({"kind": ["recurrent"]}, "unknown policy"),
     ],
 )
 def test_a_policys_arguments_are_checked_too(copies, arguments, message):

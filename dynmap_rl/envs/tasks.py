@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import math
+import sys
 from collections.abc import Sequence
 
 import numpy as np
@@ -271,6 +272,21 @@ def choose_ranges(task: BalanceReaching, ranges: SceneRanges | None) -> SceneRan
     if not issubclass(ranges.scene, task.ranges.scene):
         raise ValueError(f"{task.name} needs {type(task.ranges).__name__}, not {type(ranges).__name__}")
     return ranges
+
+
+def stored_task(name: str) -> BalanceReaching:
+    """The task that a file names. Files run no code: a class of one's own is found only if it is imported already.
+
+    Raises:
+        ValueError: there is no such task, or it is not imported.
+    """
+    if ":" not in name:
+        return get_task(name)
+    module, attribute = name.split(":", 1)
+    task = getattr(sys.modules.get(module), attribute, None)
+    if isinstance(task, type) and issubclass(task, BalanceReaching):
+        return task()
+    raise ValueError(f"a file names the task {name}, but does not get to import it; do so with --task {name}")
 
 
 def get_task(name: str) -> BalanceReaching:

@@ -25,6 +25,10 @@ from dynmap_rl.weights import save_weights
 
 from .policy import ExpertNetwork, make_actor
 
+POSITIVE = (  # settings
+    "num_envs", "iterations", "epochs", "minibatch", "checkpoint_every", "eval_episodes", "final_episodes", "threads",
+)  # fmt: skip
+
 
 def train_ppo(
     env: EnvBase,

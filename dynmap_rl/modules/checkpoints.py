@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from pathlib import Path
 
 import torch
@@ -39,7 +38,7 @@ def make_policy(
 
 def check_policy(kind: str) -> None:
     """Raises ``ValueError`` for an unknown kind."""
-    if kind not in POLICIES:
+    if str(kind) not in POLICIES:
         raise ValueError(f"unknown policy {kind!r}; choose from {sorted(POLICIES)}")
 
 
@@ -117,7 +116,11 @@ def load_actor(run: str | Path, seed: int = 0) -> Actor:
 
 def find_run(run: str | Path) -> Path:
     """The folder of a run: one that ships with the package, by its name, or one on the Hugging Face hub, by its id
-    (``user/name``; its JSON and safetensors are downloaded), or else the path itself."""
+    (``user/name``), of which the settings, world models and policies are downloaded, or else the path itself.
+
+    Raises:
+        ValueError: there is neither such a folder nor such a run on the hub.
+    """
     shipped, folder = SHIPPED / run, Path(run).expanduser()
     if (shipped / "config.json").exists():
         return shipped
@@ -127,9 +130,12 @@ def find_run(run: str | Path) -> Path:
     from httpx import HTTPError
     from huggingface_hub import snapshot_download
 
-    with suppress(OSError, ValueError, HTTPError):  # no such id, or no network
-        return Path(snapshot_download(run, allow_patterns=["*.json", "*.safetensors"]))
-    return folder
+    parts = ["config.json", "eval.json", "world_model/*", "seed_*/world_model/*", "seed_*/policy/*"]
+    try:
+        return Path(snapshot_download(run, allow_patterns=parts))
+    except (OSError, ValueError, HTTPError) as error:  # of the hub's client, or of the network below it
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise ValueError(f"no policy at {run}, neither as a folder nor on the hub ({reason})") from error
 
 
 def _read_arguments(folder: Path) -> dict:

@@ -49,7 +49,7 @@ class FeedforwardPolicy(nn.Module):
         return self(latent, hidden1, hidden2, goal), state
 
     def initial_state(self, batch: int, device=None) -> None:
-        """The memory at the start of B episodes: none, or four zero tensors ``[B, width]``."""
+        """None: it has no memory."""
         return None
 
 
@@ -92,7 +92,7 @@ class RecurrentPolicy(nn.Module):
         return self._act(x, state[2]), state
 
     def initial_state(self, batch: int, device=None) -> State:
-        """The memory at the start of B episodes: none, or four zero tensors ``[B, width]``."""
+        """The memory at the start of B episodes: four zero tensors ``[B, width]``."""
         return self.lstm.initial_state(batch, device)
 
     def _embed(self, latent, hidden1, hidden2, goal) -> torch.Tensor:

@@ -76,7 +76,6 @@ class ImitationLoss(LossModule):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
-    out_keys = ["loss_policy"]
 
     def __init__(self, policy: FeedforwardPolicy | RecurrentPolicy, emphasis: float = 0.0):
         super().__init__()
@@ -87,6 +86,11 @@ class ImitationLoss(LossModule):
         """What the loss reads, as ``set_keys`` names it."""
         keys = self.tensor_keys
         return [unravel_key(k) for k in (keys.latent, keys.hidden1, keys.hidden2, keys.goal, keys.action)]
+
+    @property
+    def out_keys(self) -> list[str]:
+        """The loss."""
+        return ["loss_policy"]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:

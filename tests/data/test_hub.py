@@ -110,13 +110,15 @@ RUN = """
 import subprocess
 from pathlib import Path
 
+import pytest
 import torch
 
 from dynmap_rl.modules import load_actor
 from dynmap_rl.modules.checkpoints import SHIPPED, find_run
 
 run = SHIPPED / "balance_reaching"
-command = ["hf", "upload", "someone/run", str(run), ".", "--include", "*.json", "--include", "*.safetensors"]
+parts = ["config.json", "eval.json", "world_model/*", "seed_*/policy/*", "seed_*/world_model/*"]
+command = ["hf", "upload", "someone/run", str(run), "."] + [word for part in parts for word in ("--include", part)]
 if {push}:
     subprocess.run(command, check=True)
 found = find_run("someone/run")
@@ -125,7 +127,8 @@ files = [sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_fi
 assert files[0] == files[1]
 for ours, theirs in zip(*(load_actor(name).state_dict().values() for name in (run, "someone/run"))):
     assert torch.equal(ours, theirs)
-assert find_run("someone/else") == Path("someone/else")
+with pytest.raises(ValueError, match="no policy at someone/else, neither as a folder nor on the hub"):
+    find_run("someone/else")
 """
 
 

@@ -1,6 +1,11 @@
 """The same command gives the same metrics, results and weights, to the last bit, for every recipe that trains; all but
 the wall-clock time."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 from commands import place_recordings, run
 from kills import contents
@@ -9,7 +14,7 @@ PPO = "--iterations 2 --checkpoint_every 1 --epochs 1 --minibatch 240 --num_envs
 SOURCE = "--world_model runs/decoupled/balance_reaching/none_recurrent_smoke"
 TASKS = "balance_reaching", "bin_dropping"
 RECIPES = {
-    "decoupled": "--smoke --supervision none",
+    "decoupled": "--smoke --supervision none --seeds 0,1",
     "joint": "--smoke",
     "end_to_end": "--smoke",
     "generalize": f"--smoke --task bin_dropping {SOURCE}",
@@ -18,15 +23,26 @@ RECIPES = {
 }
 
 
+def run_all(folder):
+    for recipe, arguments in RECIPES.items():
+        result = run(folder, recipe, *arguments.split())
+        assert result.returncode == 0, result.stderr
+
+
 @pytest.fixture(scope="module")
 def twice(tmp_path_factory, recordings):
-    """Two folders, in each of which every recipe ran."""
+    """Two folders, in each of which every recipe ran: here, and in a process with another seed for Python's hashes."""
     folders = [tmp_path_factory.mktemp("twice") for _ in range(2)]
     for folder in folders:
         place_recordings(folder, recordings, *TASKS)
-        for recipe, arguments in RECIPES.items():
-            result = run(folder, recipe, *arguments.split())
-            assert result.returncode == 0, result.stderr
+    run_all(folders[0])
+    code = "import sys; sys.path[:0] = sys.argv[2:]; import test_determinism as t; t.run_all(t.Path(sys.argv[1]))"
+    paths = Path(__file__).parents[2], Path(__file__).parents[1], Path(__file__).parent
+    command = [sys.executable, "-c", code, folders[1], *paths]
+    result = subprocess.run(
+        command, env={**os.environ, "PYTHONHASHSEED": "1"}, capture_output=True, text=True
+    )
+    assert result.returncode == 0, result.stderr
     return folders
 
 

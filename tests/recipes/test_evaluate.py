@@ -72,7 +72,7 @@ def test_the_shipped_policy_does_as_well_as_its_results_say(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--policy", "nothing"], "nothing holds no policy of LeRobot"),
+        (["--policy", "nothing"], "there is no policy at nothing"),
         (["--policy", "balance_reaching", "--seed", "7"], "holds no checkpoint"),
         (["--expert", "bin_dropping"], "sees states of bin_dropping, which balance_reaching does not have"),
         (["--policy", "nothing", "--expert", "balance_reaching"], "name one of them"),

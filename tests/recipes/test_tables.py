@@ -94,7 +94,7 @@ def test_a_cell_that_fails_says_where_to_look_and_the_others_go_on(tmp_path):
     assert result.returncode == 2
     assert "balance_reaching_joint_none_recurrent failed; see runs/tables/" in result.stderr
     assert "bin_dropping_joint_none_recurrent waits for its world model" in result.stderr
-    assert "joint_none_recurrent.log, which ends with ['error: " in result.stderr
+    assert "joint_none_recurrent.log, which ends with: error: " in result.stderr
     assert "holds a run with other settings" in result.stderr
 
 

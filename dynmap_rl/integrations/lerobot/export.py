@@ -20,14 +20,14 @@ def export_to_lerobot(run: str | Path, folder: str | Path, seed: int = 0) -> Pat
     them.
 
     Args:
-        run: a run folder of ``recipes/decoupled.py``, ``joint.py``, ``end_to_end.py`` or ``generalize.py``.
+        run: a run folder of ours, or its id on the hub (see :func:`dynmap_rl.modules.load_actor`).
         folder: gets ``config.json``, ``model.safetensors`` and the processors.
         seed: of the policy.
 
     Raises:
         ValueError: the run holds no such policy, or one of another scene than ours.
     """
-    run, folder = Path(run), Path(folder)
+    folder = Path(folder)
     actor = modules.load_actor(run, seed)
     world_model, policy = actor.world_model, actor.policy
     sizes = {"action": policy.action.size, "goal": policy.goal.size}
