@@ -5,18 +5,11 @@ import json
 import re
 from pathlib import Path
 
-import pytest
-
-from dynmap_rl.evaluation import success_gap
-from dynmap_rl.evaluation.report import markdown_row, read_rows
+from dynmap_rl.evaluation.findings import markdown_findings
+from dynmap_rl.evaluation.tables import COLUMNS, markdown_overview, markdown_table, read_cells
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
-RESULTS = [
-    p
-    for p in sorted((ROOT / "recipes/results").glob("*.json"))
-    if "test_protocol" in json.loads(p.read_text())
-]
 
 
 def test_python_snippets_run(tmp_path, monkeypatch):
@@ -30,29 +23,44 @@ def test_python_snippets_run(tmp_path, monkeypatch):
     assert namespace["losses"]["loss_rgb"] > 0
 
 
-@pytest.mark.parametrize("path", RESULTS, ids=lambda path: path.stem)
-def test_table_rows_are_those_of_the_results(path):
-    assert markdown_row(json.loads(path.read_text())) in README
+def test_the_tables_are_those_of_the_results():
+    results = ROOT / "recipes/results"
+    assert markdown_overview(results) in README
+    for columns in COLUMNS.values():
+        for column in columns:
+            assert markdown_table(results, column) in README, column
 
 
-@pytest.mark.parametrize(
-    ("task", "policy", "sentence"),
-    [
-        ("balance_reaching", "feedforward", "feedforward {} points {}"),
-        ("balance_reaching", "recurrent", "recurrent {} points {}"),
-        ("balance_reaching_obstacle", "recurrent", "a gap of {} points {} in task 2"),
-        ("bin_dropping", "recurrent", "of {} points {} in task 3"),
-    ],
-)
-def test_gaps_are_those_of_the_results(task, policy, sentence):
-    with_dynamics, without = (
-        read_rows(ROOT / "recipes/results" / f"{task}_decoupled_{name}_{policy}.json")
-        for name in ("position_velocity", "none")
+def test_the_findings_are_those_of_the_results():
+    assert markdown_findings(ROOT / "recipes/results") in README
+
+
+def test_claims_are_those_of_the_results():
+    """The numbers that the prose rounds."""
+    cells = read_cells(ROOT / "recipes/results")
+    text = " ".join(README.split())
+
+    def rates(policy, *rows, name="SR", training="decoupled"):
+        found = (cells["balance_reaching", training, policy, row] for row in rows)
+        return [cell["test_protocol"][name] for cell in found]
+
+    with_position = "RGB+[P]", "RGB+[P+V]", "RGB+[P+A]", "RGB+[P+V+A]"
+    without = "Only-RGB", "RGB+[V]", "RGB+[A]", "RGB+[V+A]"
+    both = [rate for policy in ("feedforward", "recurrent") for rate in rates(policy, *with_position)]
+    assert round(rates("recurrent", "Only-RGB")[0]) == round(rates("feedforward", "Only-RGB")[0]) == 62
+    assert min(both) > 99
+    assert "position takes the decoupled policies from 62 % to above 99 %" in text
+    drops = [rates(policy, *without, name="DR") for policy in ("feedforward", "recurrent")]
+    assert (
+        f"in {min(drops[0]):.0f} to {max(drops[0]):.0f} % of the episodes and a recurrent one in 1 %" in text
     )
-    gap = success_gap(with_dynamics, without)
-    low, high = gap["interval"]
-    expected = sentence.format(f"{gap['gap']:.1f}", f"[{low:.1f}, {high:.1f}]")
-    assert expected in " ".join(README.split())
+    assert all(0.5 <= rate < 1.5 for rate in drops[1])
+    main = cells["balance_reaching", "decoupled", "recurrent", "RGB+[P+V]"]["test_protocol"]
+    assert f"an SR of {main['SR']:.1f} % and a PE of {main['PE']:.0f} mm" in text
+    for name, task in (("balance_reaching_obstacle", 2), ("bin_dropping", 3)):
+        file = f"recipes/results/{name}_own_position_velocity_recurrent.json"
+        rate = json.loads((ROOT / file).read_text())["test_protocol"]["SR"]
+        assert f"[{rate:.1f} %]({file}) in task {task}" in text
 
 
 def test_every_option_and_file_that_the_readme_names_exists():

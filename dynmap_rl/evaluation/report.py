@@ -120,13 +120,8 @@ def _localization(results: list[dict]) -> dict[str, float]:
     return {name: float(np.mean([r["test"]["summary"][name] for r in results])) for name in names}
 
 
-def read_rows(path: Path) -> list[list[dict]]:
-    """The rows on the shared start states of every policy seed of an ``eval.json``."""
-    return result_rows(read_json(path))
-
-
 def result_rows(result: dict) -> list[list[dict]]:
-    """The same of an ``eval.json`` that is already read."""
+    """The rows on the shared start states of every policy seed of an ``eval.json``."""
     return [_rows(seed["test"]["rows"]) for seed in result["results"]]
 
 

@@ -60,20 +60,20 @@ def success_gap(rows_a: list[list[dict]], rows_b: list[list[dict]]) -> dict:
     if any(s != scenes[0] for s in scenes):
         raise ValueError("the two results are not on the same start states; evaluate both again")
 
-    def rate(rows):
-        return np.mean([[row["success"] for row in seed] for seed in rows], axis=0)
+    def count(rows, weight):  # whole numbers, so that a tie is one
+        return weight * np.sum([[row["success"] for row in seed] for seed in rows], axis=0)
 
-    a, b = rate(rows_a), rate(rows_b)
-    difference = 100 * (a - b)
+    a, b = count(rows_a, len(rows_b)), count(rows_b, len(rows_a))
+    difference = 100 * (a - b) / (len(rows_a) * len(rows_b))
     gap = float(difference.mean())
     if np.ptp(difference) == 0:
         return {"gap": gap, "interval": (gap, gap), "p": 1.0 if gap == 0 else 0.0}
     interval = bootstrap((difference,), np.mean, rng=np.random.default_rng(0)).confidence_interval
     test = permutation_test(
-        (a, b), _mean_difference, permutation_type="samples", batch=500, rng=np.random.default_rng(0)
+        (a, b), _difference, permutation_type="samples", batch=500, rng=np.random.default_rng(0)
     )
     return {"gap": gap, "interval": (float(interval.low), float(interval.high)), "p": float(test.pvalue)}
 
 
-def _mean_difference(a: np.ndarray, b: np.ndarray, axis: int) -> np.ndarray:
-    return a.mean(axis) - b.mean(axis)
+def _difference(a: np.ndarray, b: np.ndarray, axis: int) -> np.ndarray:
+    return (a - b).sum(axis)

@@ -44,6 +44,14 @@ def test_p_is_that_of_a_sign_test_where_each_start_state_has_one_outcome():
     assert success_gap([b], [a])["p"] == pytest.approx(14 / 64)
 
 
+def test_p_does_not_depend_on_rounding():
+    """One of three policies fails in three starts of 1,000, where the others always succeed: 2 / 2**3 by hand."""
+    a = [rows(1000, count=1000), rows(1000, count=1000), rows(997, count=1000)]
+    b = [rows(1000, count=1000)] * 3
+    assert success_gap(a, b)["p"] == pytest.approx(0.25, abs=0.02)
+    assert success_gap(b, a[2:])["p"] == pytest.approx(0.25, abs=0.02)
+
+
 def test_gap_refuses_other_start_states():
     other = [dict(row, scene_seed=row["scene_seed"] + 1) for row in rows(5)]
     with pytest.raises(ValueError, match="start states"):
