@@ -51,10 +51,8 @@ def test_claims_are_those_of_the_results():
     assert min(both) > 99
     assert "position takes the decoupled policies from 62 % to above 99 %" in text
     drops = [rates(policy, *without, name="DR") for policy in ("feedforward", "recurrent")]
-    assert (
-        f"in {min(drops[0]):.0f} to {max(drops[0]):.0f} % of the episodes and a recurrent one in 1 %" in text
-    )
-    assert all(0.5 <= rate < 1.5 for rate in drops[1])
+    drop = f"drops the block in {min(drops[0]):.0f} to {max(drops[0]):.0f} % of the episodes"
+    assert f"{drop} and a recurrent one in under 1 %" in text and max(drops[1]) < 1
     main = cells["balance_reaching", "decoupled", "recurrent", "RGB+[P+V]"]["test_protocol"]
     assert f"an SR of {main['SR']:.1f} % and a PE of {main['PE']:.0f} mm" in text
     for name, task in (("balance_reaching_obstacle", 2), ("bin_dropping", 3)):
