@@ -56,6 +56,11 @@ def test_claims_are_those_of_the_results():
     main = cells["balance_reaching", "decoupled", "recurrent", "RGB+[P+V]"]["test_protocol"]
     assert f"an SR of {main['SR']:.1f} % and a PE of {main['PE']:.0f} mm" in text
     for name, task in (("balance_reaching_obstacle", 2), ("bin_dropping", 3)):
+        with_dynamics, plain = (
+            cells[name, "decoupled", "recurrent", row]["test_protocol"]["SR"]
+            for row in ("RGB+[P+V]", "Only-RGB")
+        )
+        assert re.search(rf"is worth .*?{with_dynamics - plain:.0f} (points )?on task {task}", text)
         file = f"recipes/results/{name}_own_position_velocity_recurrent.json"
         rate = json.loads((ROOT / file).read_text())["test_protocol"]["SR"]
         assert f"[{rate:.1f} %]({file}) in task {task}" in text
