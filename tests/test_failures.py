@@ -279,7 +279,8 @@ def test_features_that_do_not_fit_are_not_begun(place, monkeypatch):
 
 def test_ctrl_c(place):
     command = f"{TRAIN} --updates 300"
-    process = start(place, command)
+    # A shell's job in the background, and with it this test, would have it ignore Ctrl-C.
+    process = start(place, command, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
     while not (place / "runs/new/metrics.jsonl").exists():
         assert process.poll() is None, process.stderr.read()
         time.sleep(0.1)
@@ -302,7 +303,7 @@ def test_no_display(place):
     [
         (
             "ray",
-            "tables --smoke --launcher ray --only joint_none",
+            "tables --smoke --launcher ray --only joint_none --results results",
             r'needs Ray: pip install "dynmap_rl\[ray\]"',
         ),
         ("dynmap_rl.integrations.lerobot", "evaluate --policy datasets", r"install 'dynmap_rl\[lerobot\]'"),
