@@ -55,7 +55,7 @@ def main(config: Config) -> None:
 
 def judge_policy(config: Config) -> tuple[str, dict]:
     """The name of the result, and the result: ``DR``, ``PE``, ``SR`` and what became of every episode."""
-    from dynmap_rl.envs.tasks import get_task, stored_task
+    from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.evaluation import evaluate
     from dynmap_rl.modules import find_run, load_actor
     from dynmap_rl.runs import read_json
@@ -64,14 +64,12 @@ def judge_policy(config: Config) -> tuple[str, dict]:
     facts = folder / "config.json"
     settings = read_json(facts) if facts.exists() else {}
     task = config.task or settings.get("task", "balance_reaching")
-    if not config.task:
-        stored_task(task)
-    description = get_task(task).description
+    description = get_task(task, from_file=not config.task).description
     if not folder.exists():
         raise ValueError(f"there is no policy at {config.policy}; train one with recipes/decoupled.py")
     if (folder / "world_model").exists() or any(folder.glob("seed_*")):
         actor = load_actor(folder, config.seed)
-    elif folder != Path(config.policy) and not config.trust_remote_code:
+    elif not Path(config.policy).expanduser().exists() and not config.trust_remote_code:
         raise ValueError(
             f"{config.policy} is a policy of LeRobot on the hub, whose files may name code to run; if you trust whoever "
             "put it there, add --trust_remote_code"
@@ -102,7 +100,7 @@ def judge_expert(config: Config) -> tuple[str, dict]:
     """The name of the result, and the result: ``rates`` and ``intervals`` (%)."""
     from dynmap_rl.envs.geometry import path_is_blocked, way_from_start
     from dynmap_rl.envs.scene import ObstacleScene
-    from dynmap_rl.envs.tasks import get_task, stored_task
+    from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.evaluation import scene_seeds, wilson
     from dynmap_rl.experts import find_expert, list_checkpoints, load_expert, roll_out
     from dynmap_rl.runs import read_json
@@ -111,7 +109,8 @@ def judge_expert(config: Config) -> tuple[str, dict]:
     expert = config.expert or task.name
     checkpoint = config.checkpoint or list_checkpoints(expert)[-1]
     network = load_expert(expert, checkpoint)
-    trained_on = stored_task(read_json(find_expert(expert) / f"{checkpoint}.json")["task"])
+    facts = read_json(find_expert(expert) / f"{checkpoint}.json")
+    trained_on = get_task(facts["task"], from_file=True)
     if not issubclass(task.ranges.scene, trained_on.ranges.scene):
         raise ValueError(
             f"the expert {expert} sees states of {trained_on.name}, which {task.name} does not have"

@@ -48,21 +48,20 @@ class Config:
 def main(config: Config) -> None:
     from dynmap_rl.data import push_dataset
     from dynmap_rl.data.human import list_shards, open_folder, publish_episodes
-    from dynmap_rl.envs.tasks import get_task, stored_task
+    from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.envs.world import CONTROL_DT
     from dynmap_rl.modules import find_run, load_actor
     from dynmap_rl.play import PlayWindow, Session
     from dynmap_rl.runs import read_json
 
-    task, actor = config.task, None
+    trained_on, actor = None, None
     if config.policy:
         run = find_run(config.policy)
         actor = load_actor(run, config.seed)
-        if not task and (run / "config.json").exists():
-            task = read_json(run / "config.json").get("task")
-            stored_task(task)
-    task = task or "balance_reaching"
-    get_task(task)
+        if (run / "config.json").exists():
+            trained_on = read_json(run / "config.json").get("task")
+    task = config.task or trained_on or "balance_reaching"
+    get_task(task, from_file=not config.task)
     if config.size < 64 or (config.steps is not None and config.steps < 1):
         raise ValueError("--size must be at least 64 and --steps at least 1")
     if config.gif and not config.steps:

@@ -178,11 +178,11 @@ CASES = [
     (nothing, f"{TRAIN} --threads 0", "--threads must be at least 1"),
     (nothing, "expert --epochs 0", "--epochs must be at least 1"),
     (nothing, "tables --dry_run --workers 0", "--workers must be at least 1"),
-    (lambda p: change_json(p / RUN / "config.json", task="os:abort"), EVALUATE, "do so with --task os:abort"),
+    (lambda p: change_json(p / RUN / "config.json", task="this:s"), EVALUATE, "do so with --task this:s"),
     (
         lambda p: change_json(p / RUN / "config.json", task="os:abort"),
         f"play --policy {RUN}",
-        "do so with --task",
+        "is no task: it is no subclass",
     ),
     # Folders.
     (nothing, f"{TRAIN} --run /sys/run", "/sys/run.*; choose a folder that can be written to"),

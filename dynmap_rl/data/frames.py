@@ -10,6 +10,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from dynmap_rl.hub import first_line
+
 from .columns import spans
 
 TOLERANCE = 1e-4  # s, LeRobot's own, between a timestamp and the video's frame
@@ -111,7 +113,7 @@ def _decode_video(
             # PyAV comes with its own FFmpeg; torchcodec needs the system's.
             frames = decode_video_frames(path, some, TOLERANCE, backend="pyav", return_uint8=True)
         except Exception as error:  # of LeRobot or of the FFmpeg below it
-            reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+            reason = first_line(error)
             raise ValueError(f"{path} cannot be decoded ({reason}); restore the dataset") from error
         yield frames.permute(0, 2, 3, 1).numpy()
 

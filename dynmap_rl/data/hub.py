@@ -9,6 +9,7 @@ import numpy as np
 from tensordict import TensorDict
 
 from dynmap_rl.envs.world import CONTROL_DT, EPISODE_STEPS
+from dynmap_rl.hub import first_line
 
 from .loading import META, load_dataset, load_meta
 from .writing import FPS, quiet
@@ -70,7 +71,7 @@ def push_dataset(root: str | Path, repo_id: str) -> None:
                 citation_bibtex=CITATION,
             )
         except Exception as error:  # of the hub's client, or of the HTTP library below it
-            reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+            reason = first_line(error)
             raise OSError(
                 f"cannot push {root} to {repo_id} ({reason}); check the name, the network, and `hf auth login`"
             ) from error

@@ -17,6 +17,8 @@ import pyarrow.parquet as pq
 import torch
 from tensordict import TensorDict
 
+from dynmap_rl.hub import first_line, is_hub_id
+
 LEROBOT_VERSION = "v3.0"
 META = "meta/dynmap.json"
 CAMERA = "observation.images.front"
@@ -91,8 +93,7 @@ def find_dataset(dataset: str | Path) -> Path:
     folder = Path(dataset).expanduser()
     if folder.is_dir():
         return folder
-    may_be_id = isinstance(dataset, str) and len(folder.parts) == 2 and dataset[0] not in "./~"
-    if not may_be_id or folder.parts[0] == "datasets":  # where recipes/collect.py writes to
+    if not is_hub_id(dataset, "datasets"):
         raise ValueError(f"no dataset at {dataset}; record one with recipes/collect.py --output {dataset}")
     from httpx import HTTPError
     from huggingface_hub import snapshot_download
@@ -109,7 +110,7 @@ def find_dataset(dataset: str | Path) -> Path:
         ValueError,
         HTTPError,
     ) as error:  # every error of the hub's client, or of the network below it
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        reason = first_line(error)
         raise ValueError(
             f"no dataset at {dataset}, neither as a folder nor with the tag {LEROBOT_VERSION} on the hub ({reason}); "
             "check the name and the network, or record one with recipes/collect.py"

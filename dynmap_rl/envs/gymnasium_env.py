@@ -9,8 +9,8 @@ import numpy as np
 from gymnasium import spaces
 
 from .renderer import Renderer, Window
-from .scene import SceneRanges
-from .tasks import choose_ranges, get_task
+from .scene import SceneRanges, choose_ranges
+from .tasks import get_task
 from .world import ACCELERATION_LIMIT, CONTROL_DT, EPISODE_STEPS, VELOCITY_LIMIT
 
 ACTION_LIMITS = {"position": VELOCITY_LIMIT * CONTROL_DT, "acceleration": ACCELERATION_LIMIT}
@@ -100,7 +100,7 @@ class DynmapEnv(gym.Env):
         self.task_description = self.task.description
         self.obs_type = obs_type
         self.control = control
-        self.ranges = choose_ranges(self.task, ranges)
+        self.ranges = choose_ranges(self.task.ranges, ranges)
         self.render_mode = render_mode
         self._render_size = render_size
         self._max_episode_steps = EPISODE_STEPS

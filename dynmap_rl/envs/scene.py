@@ -176,3 +176,12 @@ def scene_seed(split: str, index: int) -> int:
     if not 0 <= index < SEEDS_PER_SPLIT:
         raise ValueError(f"scene index {index} is outside 0..{SEEDS_PER_SPLIT - 1}")
     return SPLITS[split] * SEEDS_PER_SPLIT + index
+
+
+def choose_ranges(own: SceneRanges, ranges: SceneRanges | None) -> SceneRanges:
+    """The ranges themselves, or a task's ``own`` for None; ``ValueError`` for those of scenes that lack what it needs."""
+    if ranges is None:
+        return own
+    if not issubclass(ranges.scene, own.scene):
+        raise ValueError(f"the task needs {type(own).__name__}, not {type(ranges).__name__}")
+    return ranges

@@ -1,6 +1,6 @@
 """The tasks: what is drawn beside cart and block, what is rewarded, and what counts as success (paper, Sec. IV-B).
 
-A task is any object with the attributes and methods of :class:`BalanceReaching`. A task of your own needs no place
+A task is :class:`BalanceReaching` or a subclass of it. A task of your own needs no place
 in :data:`TASKS`: wherever a task is named, ``"your_module:YourTask"`` names the class.
 """
 
@@ -265,46 +265,31 @@ def squared(dynamics: np.ndarray, limits: np.ndarray) -> float:
 TASKS = {task.name: task for task in (BalanceReaching(), BalanceReachingObstacle(), BinDropping())}
 
 
-def choose_ranges(task: BalanceReaching, ranges: SceneRanges | None) -> SceneRanges:
-    """The ranges themselves, or the task's own for None; ``ValueError`` for those of another task's scenes."""
-    if ranges is None:
-        return task.ranges
-    if not issubclass(ranges.scene, task.ranges.scene):
-        raise ValueError(f"{task.name} needs {type(task.ranges).__name__}, not {type(ranges).__name__}")
-    return ranges
+def get_task(name: str, from_file: bool = False) -> BalanceReaching:
+    """The task of a name, or of a subclass of :class:`BalanceReaching` that is named as ``"module:Class"``.
 
-
-def stored_task(name: str) -> BalanceReaching:
-    """The task that a file names. Files run no code: a class of one's own is found only if it is imported already.
-
-    Raises:
-        ValueError: there is no such task, or it is not imported.
-    """
-    if ":" not in name:
-        return get_task(name)
-    module, attribute = name.split(":", 1)
-    task = getattr(sys.modules.get(module), attribute, None)
-    if isinstance(task, type) and issubclass(task, BalanceReaching):
-        return task()
-    raise ValueError(f"a file names the task {name}, but does not get to import it; do so with --task {name}")
-
-
-def get_task(name: str) -> BalanceReaching:
-    """The task of a name, or of a class that is named as ``"module:Class"``.
+    Args:
+        from_file: a file names it, and files run no code: its module must have been imported already.
 
     Raises:
         ValueError: there is no such task; the message lists the known ones.
     """
-    if ":" in name:
-        module, attribute = name.split(":", 1)
-        if not module or module.startswith("."):
-            raise ValueError(f"there is no task {name!r}; name a class as module:Class")
-        try:
-            return getattr(importlib.import_module(module), attribute)()
-        except (ImportError, AttributeError) as error:
-            raise ValueError(f"there is no task {name!r} ({error})") from error
-    if name not in TASKS:
+    if ":" not in name:
+        if name not in TASKS:
+            known = f"choose from {sorted(TASKS)}, or name a class as module:Class"
+            raise ValueError(f"unknown task {name!r}; {known}")
+        return TASKS[name]
+    module, attribute = name.split(":", 1)
+    if not module or module.startswith("."):
+        raise ValueError(f"there is no task {name!r}; name a class as module:Class")
+    if from_file and module not in sys.modules:
         raise ValueError(
-            f"unknown task {name!r}; choose from {sorted(TASKS)}, or name a class as module:Class"
+            f"a file names the task {name}, but does not get to import it; do so with --task {name}"
         )
-    return TASKS[name]
+    try:
+        task = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"there is no task {name!r} ({error})") from error
+    if not (isinstance(task, type) and issubclass(task, BalanceReaching)):
+        raise ValueError(f"{name!r} is no task: it is no subclass of dynmap_rl.envs.tasks.BalanceReaching")
+    return task()

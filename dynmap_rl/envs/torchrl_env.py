@@ -12,8 +12,8 @@ from torchrl.envs import EnvBase
 
 from .gymnasium_env import ACTION_LIMITS
 from .renderer import Renderer
-from .scene import SceneRanges
-from .tasks import choose_ranges, get_task
+from .scene import SceneRanges, choose_ranges
+from .tasks import get_task
 from .world import EPISODE_STEPS, World
 
 EVENTS = ("dropped", "touched", "is_success")
@@ -64,7 +64,7 @@ class DynmapBatchedEnv(EnvBase):
         super().__init__(device=device, batch_size=[num_envs])
         self.task = get_task(task)
         self.control = control
-        self.ranges = choose_ranges(self.task, ranges)
+        self.ranges = choose_ranges(self.task.ranges, ranges)
         self.renderer = Renderer() if from_pixels else None
         self.pixels_only = pixels_only
         self.worlds: list[World | None] = [None] * num_envs

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import torch
 
+from dynmap_rl.hub import first_line, is_hub_id
 from dynmap_rl.runs import read_json, write_json
 from dynmap_rl.weights import load_module, save_weights
 
@@ -124,8 +125,7 @@ def find_run(run: str | Path) -> Path:
     shipped, folder = SHIPPED / run, Path(run).expanduser()
     if (shipped / "config.json").exists():
         return shipped
-    may_be_id = isinstance(run, str) and len(folder.parts) == 2 and run[0] not in "./~"
-    if folder.exists() or not may_be_id or folder.parts[0] == "runs":  # where our recipes write to
+    if folder.exists() or not is_hub_id(run, "runs"):
         return folder
     from httpx import HTTPError
     from huggingface_hub import snapshot_download
@@ -134,7 +134,7 @@ def find_run(run: str | Path) -> Path:
     try:
         return Path(snapshot_download(run, allow_patterns=parts))
     except (OSError, ValueError, HTTPError) as error:  # of the hub's client, or of the network below it
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        reason = first_line(error)
         raise ValueError(f"no policy at {run}, neither as a folder nor on the hub ({reason})") from error
 
 

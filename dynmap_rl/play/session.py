@@ -11,7 +11,7 @@ from tensordict import TensorDict
 
 from dynmap_rl.data.demonstrations import KEYS
 from dynmap_rl.envs import DynmapBatchedEnv, scene_seed
-from dynmap_rl.envs.tasks import BalanceReaching, stored_task
+from dynmap_rl.envs.tasks import BalanceReaching, get_task
 from dynmap_rl.envs.world import ACTION_LIMIT, CONTROL_DT, EPISODE_STEPS
 from dynmap_rl.experts import find_expert, list_checkpoints, load_expert
 from dynmap_rl.modules import DYNAMICS, Actor
@@ -182,7 +182,8 @@ def _find_expert(task: BalanceReaching, name: str | Path, named: bool):
         if named:
             raise
         return None, None
-    sees = stored_task(read_json(find_expert(name) / f"{list_checkpoints(name)[-1]}.json")["task"])
+    facts = read_json(find_expert(name) / f"{list_checkpoints(name)[-1]}.json")
+    sees = get_task(facts["task"], from_file=True)
     if not issubclass(task.ranges.scene, sees.ranges.scene):
         raise ValueError(f"the expert {name} sees states of {sees.name}, which {task.name} does not have")
     return expert, sees

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from dynmap_rl.envs import DynmapBatchedEnv, DynmapEnv
-from dynmap_rl.envs.scene import BinRanges, ObstacleRanges, Scene, SceneRanges
-from dynmap_rl.envs.tasks import MARKER_SIZE, TASKS, choose_ranges, get_task
+from dynmap_rl.envs.scene import BinRanges, ObstacleRanges, Scene, SceneRanges, choose_ranges
+from dynmap_rl.envs.tasks import MARKER_SIZE, TASKS, get_task
 from dynmap_rl.envs.world import ACTION_LIMIT, EPISODE_STEPS, World
 from dynmap_rl.experts import load_expert
 
@@ -114,13 +114,13 @@ def test_no_start_is_solved_or_lost(task):
     ],
 )
 def test_ranges_of_another_task_raise(make, task, ranges, needed):
-    with pytest.raises(ValueError, match=f"{task} needs {needed}, not {type(ranges).__name__}"):
+    with pytest.raises(ValueError, match=f"the task needs {needed}, not {type(ranges).__name__}"):
         make(task, ranges=ranges)
 
 
 @every_task
 def test_own_ranges_are_the_default(task):
-    assert choose_ranges(task, None) is task.ranges
+    assert choose_ranges(task.ranges, None) is task.ranges
     assert isinstance(task.sample_scene(np.random.default_rng(0)), task.ranges.scene)
 
 

@@ -12,6 +12,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from dynmap_rl.data.loading import CAMERA
+from dynmap_rl.hub import first_line
 
 
 class LeRobotActor(TensorDictModuleBase):
@@ -44,7 +45,7 @@ class LeRobotActor(TensorDictModuleBase):
                 config, str(path), preprocessor_overrides={"device_processor": {"device": str(device)}}
             )
         except (OSError, KeyError, ValueError, ImportError) as error:
-            reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+            reason = first_line(error)
             raise ValueError(f"{path} holds no policy of LeRobot ({reason})") from error
         self.reset()
 

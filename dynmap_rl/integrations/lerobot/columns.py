@@ -12,7 +12,7 @@ from tensordict import TensorDict
 
 from dynmap_rl.data import load_meta, normalization_constants
 from dynmap_rl.data.loading import META, NEEDED
-from dynmap_rl.envs.tasks import stored_task
+from dynmap_rl.envs.tasks import get_task
 
 
 def read_columns(root: str | Path) -> TensorDict:
@@ -63,4 +63,4 @@ def find_constants(root: str | Path, columns: TensorDict) -> dict[str, dict[str,
 
 def is_symmetric(root: str | Path) -> bool:
     """Whether mirrored and shifted demonstrations of the dataset's task are demonstrations, so far as it tells."""
-    return (Path(root) / META).exists() and stored_task(load_meta(root)["task"]).symmetric
+    return (Path(root) / META).exists() and get_task(load_meta(root)["task"], from_file=True).symmetric
