@@ -6,9 +6,7 @@ The same command on the same folder resumes it. Torch is imported where it is us
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import errno
 import io
 import json
 import math
@@ -16,7 +14,6 @@ import multiprocessing
 import os
 import random
 import signal
-import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -30,13 +27,6 @@ if TYPE_CHECKING:
     import torch
 
 
-HINTS = {
-    **dict.fromkeys(
-        (errno.ENOSPC, errno.EDQUOT, errno.EFBIG), "make room; the same command goes on where it was"
-    ),
-    **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "choose a folder that can be written to"),
-    **dict.fromkeys((errno.EEXIST, errno.ENOTDIR, errno.EISDIR), "choose another path"),
-}
 LOCKS = {}  # of this process's folders: released when nothing refers to them
 
 
@@ -115,20 +105,6 @@ def lock_folder(folder: Path) -> None:
         LOCKS[path].acquire()
     except Timeout as error:
         raise ValueError(f"another process works in {folder}; wait for it, or stop it") from error
-
-
-def replace_defaults(config, values: dict) -> None:
-    """Set those fields of a dataclass that still have their default: what was asked for stays."""
-    for name, value in values.items():
-        if getattr(config, name) == getattr(type(config), name):
-            setattr(config, name, value)
-
-
-def check_at_least_one(config, *names: str) -> None:
-    """Raises ``ValueError`` for one of these settings that is below 1; those that there are not do not matter."""
-    for name in names:
-        if (value := getattr(config, name, 1)) < 1:
-            raise ValueError(f"--{name} must be at least 1, not {value}")
 
 
 def append_metrics(folder: Path, step: int, **metrics: float) -> None:
@@ -218,11 +194,6 @@ def seed_everything(seed: int) -> None:
     torch.manual_seed(seed)
 
 
-def command_line() -> str:
-    """The command that started this process, as it would be given in the root of the repository."""
-    return " ".join(["python", f"recipes/{Path(sys.argv[0]).name}", *sys.argv[1:]])
-
-
 def run_processes(work: Callable[[tuple], None], arguments: list[tuple], count: int) -> None:
     """``count`` at a time, each in a process of its own; one at a time, or one alone, in this one.
 
@@ -249,35 +220,6 @@ def start_worker() -> None:
     tqdm.set_lock(threading.RLock())  # its own is a semaphore, which Python would report as leaked
     parent = multiprocessing.parent_process()
     threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
-
-
-def run_recipe(main, config_class) -> None:
-    """Parse the settings, run ``main(config)``, and turn an expected error into one line and exit code 2.
-
-    ``--debug`` (anywhere on the command line) shows the traceback instead.
-    """
-    import draccus
-
-    # Large pages for torch's memory, whose small ones cost a fifth of a world model's training.
-    os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
-    sys.path.append(os.getcwd())  # where the module of a task named module:Class may lie; it shadows nothing
-    arguments = [a for a in sys.argv[1:] if a != "--debug"]
-    debug = len(arguments) < len(sys.argv) - 1
-    flags = {f"--{f.name}" for f in dataclasses.fields(config_class) if f.type in (bool, "bool")}
-    for i, argument in reversed(list(enumerate(arguments))):  # a bare flag means true
-        if argument in flags and arguments[i + 1 : i + 2] not in (["true"], ["false"]):
-            arguments.insert(i + 1, "true")
-    try:
-        config = draccus.parse(config_class, args=arguments, exit_on_error=False)
-        main(config)
-    except KeyboardInterrupt:
-        sys.exit("stopped; the same command goes on where it was")
-    except (ValueError, OSError, argparse.ArgumentError, draccus.utils.DraccusException) as error:
-        if debug:
-            raise
-        hint = HINTS.get(getattr(error, "errno", None))
-        print(f"error: {error}{(hint and f'; {hint}') or ''}", file=sys.stderr)
-        sys.exit(2)
 
 
 def _dump(value, indent: str = "") -> str:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from tensordict import TensorDictBase
 
-from dynmap_rl import data, modules, runs
+from dynmap_rl import commands, data, modules, runs
 from dynmap_rl.data import NO_TASK
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.world import EPISODE_STEPS
@@ -49,7 +49,7 @@ def check_settings(settings) -> list[int]:
     if settings.test_episodes > SHARED_STARTS:
         raise ValueError(f"there are {SHARED_STARTS} shared start states, not {settings.test_episodes}")
     numbers = "updates", "windows", "rgb_steps", "policy_updates", "policy_batch", "threads"
-    runs.check_at_least_one(settings, *numbers, "test_episodes", "paper_episodes")
+    commands.check_at_least_one(settings, *numbers, "test_episodes", "paper_episodes")
     if not 2 <= (steps := getattr(settings, "window_steps", 2)) <= EPISODE_STEPS:
         raise ValueError(f"--window_steps must be 2 to {EPISODE_STEPS}, not {steps}")
     if foreign:

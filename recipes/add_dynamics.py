@@ -10,7 +10,7 @@ recipes/joint.py are supervised on. The dataset stays as it is; the new one appe
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynmap_rl.runs import run_recipe
+from dynmap_rl.commands import run_recipe
 
 
 @dataclass

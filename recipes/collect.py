@@ -10,7 +10,7 @@ The experts ship with the package. The same command goes on where it was stopped
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynmap_rl.runs import run_recipe
+from dynmap_rl.commands import run_recipe
 
 
 @dataclass

@@ -12,7 +12,7 @@ goes on where it was stopped, or says that it is done.
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynmap_rl.runs import run_recipe
+from dynmap_rl.commands import replace_defaults, run_recipe
 
 
 @dataclass
@@ -85,9 +85,9 @@ def main(config: Config) -> None:
     from dynmap_rl.training import train_world_model
 
     if config.smoke:
-        runs.replace_defaults(config, SMOKE)
+        replace_defaults(config, SMOKE)
     if config.task == data.NO_TASK:
-        runs.replace_defaults(config, settings.FOREIGN)
+        replace_defaults(config, settings.FOREIGN)
     supervision = parse_supervision(config.supervision)
     seeds = settings.check_settings(config)
     trained = None

@@ -11,7 +11,7 @@ says that it is done.
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynmap_rl.runs import run_recipe
+from dynmap_rl.commands import replace_defaults, run_recipe
 
 
 @dataclass
@@ -61,7 +61,7 @@ def main(config: Config) -> None:
     from dynmap_rl.evaluation import print_row, write_report
 
     if config.smoke:
-        runs.replace_defaults(config, SMOKE)
+        replace_defaults(config, SMOKE)
     seeds = settings.check_settings(config)
     name = f"{config.policy}{'_smoke' if config.smoke else ''}"
     folder = config.run or Path("runs/end_to_end") / get_task(config.task).name / name

@@ -13,7 +13,7 @@ to the goal is blocked and how often the shortest way leads around the obstacle.
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynmap_rl.runs import run_recipe
+from dynmap_rl.commands import command_line, run_recipe
 
 
 @dataclass
@@ -40,7 +40,7 @@ class Config:
 
 
 def main(config: Config) -> None:
-    from dynmap_rl.runs import command_line, write_json
+    from dynmap_rl.runs import write_json
 
     if config.episodes < 1:
         raise ValueError(f"--episodes must be at least 1, not {config.episodes}")
@@ -91,7 +91,7 @@ def load_lerobot(policy: str, instruction: str):
         from dynmap_rl.integrations.lerobot import LeRobotActor
     except ImportError as error:
         raise ValueError(
-            f"{policy} is no run of ours; for a policy of LeRobot install 'dynmap_rl[lerobot]' ({error})"
+            f"{policy} is no run of ours; for a policy of LeRobot: pip install '.[lerobot]' ({error})"
         ) from error
     return LeRobotActor(policy, instruction=instruction)
 

@@ -9,7 +9,7 @@ on the same folder resumes. To ship checkpoints with the package, copy them to `
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynmap_rl.runs import run_recipe
+from dynmap_rl.commands import check_at_least_one, run_recipe
 
 
 @dataclass
@@ -53,7 +53,7 @@ def main(config: Config) -> None:
     from dynmap_rl.loggers import check_logger
 
     check_logger(config.logger)
-    runs.check_at_least_one(config, *POSITIVE)
+    check_at_least_one(config, *POSITIVE)
     torch.set_num_threads(config.threads)
     env = DynmapBatchedEnv(config.task, config.num_envs, control="acceleration")
     folder = runs.open_run(

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from dynmap_rl.runs import run_recipe
+from dynmap_rl.commands import command_line, run_recipe
 
 TASKS = {
     "balance_reaching": "Task 1: Balance-Reaching",
@@ -104,7 +104,7 @@ def find_missing(config: Config, cells: list[str]) -> list[str]:
 
 def draw_distributions(config: Config, datasets: dict) -> None:
     from dynmap_rl.evaluation.figures import plot_distributions
-    from dynmap_rl.runs import command_line, write_json
+    from dynmap_rl.runs import write_json
 
     dynamics = {task: load_episodes(config, datasets, task, "train")["dynamics"] for task in datasets}
     ranges = plot_distributions(dynamics, config.output / "distributions.png")

@@ -11,7 +11,7 @@ or says that it is done.
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynmap_rl.runs import run_recipe
+from dynmap_rl.commands import replace_defaults, run_recipe
 
 
 @dataclass
@@ -64,7 +64,7 @@ def main(config: Config) -> None:
     from dynmap_rl.training import fingerprint
 
     if config.smoke:
-        runs.replace_defaults(config, SMOKE)
+        replace_defaults(config, SMOKE)
     seeds = settings.check_settings(config)
     world_model, source = frozen.load_source(config.world_model)
     if source["task"] == config.task:

@@ -11,7 +11,7 @@ says that it is done.
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynmap_rl.runs import run_recipe
+from dynmap_rl.commands import replace_defaults, run_recipe
 
 
 @dataclass
@@ -72,9 +72,9 @@ def main(config: Config) -> None:
     from dynmap_rl.evaluation import parse_supervision, print_row, write_report
 
     if config.smoke:
-        runs.replace_defaults(config, SMOKE)
+        replace_defaults(config, SMOKE)
     if config.task == data.NO_TASK:
-        runs.replace_defaults(config, settings.FOREIGN)
+        replace_defaults(config, settings.FOREIGN)
     supervision = parse_supervision(config.supervision)
     seeds = settings.check_settings(config)
     name = f"{'_'.join(supervision) or 'none'}_{config.policy}{'_smoke' if config.smoke else ''}"

@@ -11,7 +11,7 @@ says that it is done.
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynmap_rl.runs import run_recipe
+from dynmap_rl.commands import check_at_least_one, command_line, replace_defaults, run_recipe
 
 
 @dataclass
@@ -69,13 +69,13 @@ def main(config: Config) -> None:
     from dynmap_rl.training import fingerprint
 
     if config.smoke:
-        runs.replace_defaults(config, SMOKE)
+        replace_defaults(config, SMOKE)
     if config.world_model is None:
         raise ValueError(
             "--world_model is the run folder of a world model; train one with recipes/decoupled.py"
         )
     check_logger(config.logger)
-    runs.check_at_least_one(config, *POSITIVE)
+    check_at_least_one(config, *POSITIVE)
     task = get_task(config.task)
     world_model, source = frozen.load_source(config.world_model)
     world_model.requires_grad_(False)
@@ -109,7 +109,7 @@ def main(config: Config) -> None:
         "world_model_sha256": frozen_weights,
         "latents": runs.read_json(folder / "checkpoint" / f"iteration_{config.iterations:03d}.json"),
         "states": states | {"expert": config.expert or config.task},
-        "command": runs.command_line(),
+        "command": command_line(),
     }
     write_html(folder, f"PPO on latents, {task.name}", result_text(result), result["command"])
     runs.write_json(folder / "eval.json", result)

@@ -16,7 +16,7 @@ dynamics columns, and the next session adds to it.
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynmap_rl.runs import run_recipe
+from dynmap_rl.commands import run_recipe
 
 
 @dataclass

@@ -11,7 +11,7 @@ of training, tells position, velocity and acceleration (R^2). Writes two figures
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynmap_rl.runs import run_recipe
+from dynmap_rl.commands import command_line, run_recipe
 
 
 @dataclass
@@ -35,7 +35,7 @@ def main(config: Config) -> None:
     from dynmap_rl.evaluation import open_loop_errors, row_name
     from dynmap_rl.evaluation.probing import plot_open_loop, plot_probes, probe
     from dynmap_rl.frozen import load_source
-    from dynmap_rl.runs import command_line, write_json
+    from dynmap_rl.runs import write_json
 
     if min(config.train_episodes, config.test_episodes) < 1:
         raise ValueError("--train_episodes and --test_episodes must be at least 1")

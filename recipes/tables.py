@@ -3,7 +3,7 @@
     python recipes/tables.py --dry_run                  # the cells, what is done, the time that is left
     python recipes/tables.py                            # all of them, one after the other
     python recipes/tables.py --only balance_reaching_decoupled_position --workers 2
-    python recipes/tables.py --launcher ray             # on a Ray cluster (pip install "dynmap_rl[ray]")
+    python recipes/tables.py --launcher ray             # on a Ray cluster (pip install '.[ray]')
     python recipes/tables.py --print markdown           # or json: the tables from the results alone
 
 A cell is a run of another recipe; its result is a JSON in ``results``. World models are trained once and reused. A killed
@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dynmap_rl.cells import Cell, list_cells
-from dynmap_rl.runs import check_at_least_one, run_recipe
+from dynmap_rl.commands import check_at_least_one, run_recipe
 
 RECIPES = Path(__file__).parent
 
@@ -68,9 +68,13 @@ def run_cell(cell: Cell, config: Config, root: Path) -> str | None:
 def launch_local(cells: list[Cell], config: Config) -> Iterator[tuple[Cell, str | None]]:
     """Every cell with its message, in the order in which they end; each is a process of its own."""
     with ThreadPoolExecutor(config.workers) as pool:
-        running = {pool.submit(run_cell, cell, config, Path.cwd()): cell for cell in cells}
-        for future in as_completed(running):
-            yield running[future], future.result()
+        try:
+            running = {pool.submit(run_cell, cell, config, Path.cwd()): cell for cell in cells}
+            for future in as_completed(running):
+                yield running[future], future.result()
+        except BaseException:  # Ctrl-C has reached the cells in flight too; no other begins
+            pool.shutdown(cancel_futures=True)
+            raise
 
 
 def launch_ray(cells: list[Cell], config: Config) -> Iterator[tuple[Cell, str | None]]:
@@ -82,7 +86,7 @@ def launch_ray(cells: list[Cell], config: Config) -> Iterator[tuple[Cell, str | 
     try:
         import ray
     except ImportError as error:
-        raise ValueError('--launcher ray needs Ray: pip install "dynmap_rl[ray]"') from error
+        raise ValueError("--launcher ray needs Ray: pip install '.[ray]'") from error
     if not ray.is_initialized():
         ray.init(log_to_driver=False)
     remote = ray.remote(num_cpus=config.cpus, num_gpus=config.gpus, max_retries=0)(run_cell)

@@ -12,7 +12,7 @@ from unittest import mock
 
 import torch
 
-from dynmap_rl.runs import run_recipe
+from dynmap_rl.commands import run_recipe
 
 
 def run(folder: Path, recipe: str, *arguments: str) -> CompletedProcess:

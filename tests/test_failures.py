@@ -160,7 +160,8 @@ CASES = [
     (nothing, f"{TRAIN} --world_model {RUN} --supervision none", r"supervised on \('position', 'velocity'\)"),
     (nothing, f"{TRAIN} --task none --world_model {RUN}", "for another task use recipes/generalize.py"),
     # Options.
-    (nothing, f"{TRAIN} --bogus 1", "unrecognized arguments: --bogus 1"),
+    (nothing, f"{TRAIN} --bogus 1", "there is no option --bogus; see --help"),
+    (nothing, f"{TRAIN} --world-modell {RUN}", r"no option --world_modell; do you mean --world_model\?"),
     (nothing, f"{TRAIN} --updates many", "Couldn.t parse .many. into an int|updates.*int"),
     (nothing, f"{TRAIN} --supervision speed", "unknown supervision"),
     (nothing, f"{TRAIN} --task juggling", "unknown task"),
@@ -304,9 +305,9 @@ def test_no_display(place):
         (
             "ray",
             "tables --smoke --launcher ray --only joint_none --results results",
-            r'needs Ray: pip install "dynmap_rl\[ray\]"',
+            r"needs Ray: pip install '\.\[ray\]'",
         ),
-        ("dynmap_rl.integrations.lerobot", "evaluate --policy datasets", r"install 'dynmap_rl\[lerobot\]'"),
+        ("dynmap_rl.integrations.lerobot", "evaluate --policy datasets", r"pip install '\.\[lerobot\]'"),
     ],
 )
 def test_an_extra_that_is_not_installed(place, monkeypatch, module, command, message):

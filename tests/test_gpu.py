@@ -8,7 +8,7 @@ import torch
 from dynmap_rl.data import add_distractors, augment, compute_features, load_dataset, load_meta, sample_windows
 from dynmap_rl.evaluation import roll_out, scene_seeds
 from dynmap_rl.modules import Actor, make_policy, make_world_model, mixed_precision
-from dynmap_rl.objectives import WorldModelLoss
+from dynmap_rl.objectives import ImitationLoss, JointLoss, WorldModelLoss
 from dynmap_rl.training import make_optimizer, step, train_policy, train_world_model
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
@@ -19,21 +19,40 @@ SETTINGS = SimpleNamespace(
 )  # fmt: skip
 
 
-def test_a_training_step_does_not_wait_for_the_gpu(recording):
+@pytest.mark.parametrize("trained", ["world_model", "jointly", "policy"])
+def test_a_training_step_does_not_wait_for_the_gpu(recording, trained):
     episodes = load_dataset(recording, "train").exclude("next").to("cuda")
-    model = make_world_model(load_meta(recording)["normalization"], ("position",)).cuda()
-    loss_module, optimizer = WorldModelLoss(model, rgb_steps=2), make_optimizer(model, 1e-3, 1e-4)
+    constants = load_meta(recording)["normalization"]
+    model = make_world_model(constants, ("position",)).cuda()
+    policy = make_policy(constants, "recurrent", model).cuda()
     generator = torch.Generator("cuda").manual_seed(0)
-    for mode in ("default", "error"):  # the first time, kernels are loaded
-        torch.cuda.set_sync_debug_mode(mode)
-        try:
-            windows = augment(sample_windows(episodes, 4, 8, generator), generator)
-            windows = add_distractors(windows, generator)
-            with mixed_precision("cuda"):
-                losses = loss_module(windows)
-            step(sum(losses.values()), optimizer)
-        finally:
-            torch.cuda.set_sync_debug_mode("default")
+    features = compute_features(model, episodes, 1, generator).to("cuda")
+    world_model_loss = WorldModelLoss(model, rgb_steps=2)
+    loss_module = {
+        "world_model": world_model_loss,
+        "jointly": JointLoss(world_model_loss, policy, emphasis=60.0),
+        "policy": ImitationLoss(policy, emphasis=60.0),
+    }[trained]
+    optimizer = make_optimizer(loss_module, 1e-3, 1e-4)
+
+    def train() -> None:
+        if trained == "policy":
+            batch = features[torch.randint(len(features), (2,), generator=generator, device="cuda")]
+        else:
+            batch = augment(sample_windows(episodes, 4, 8, generator), generator)
+            batch = add_distractors(batch, generator)
+        with mixed_precision("cuda"):
+            losses = loss_module(batch)
+        step(sum(losses.values()), optimizer)
+
+    train()  # the first time, kernels are loaded
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        with torch.profiler.profile() as profile:  # sees those that are below torch, too
+            train()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert not [event for event in profile.events() if event.name == "cudaStreamSynchronize"]
 
 
 def test_training_and_control_end_to_end(recording, tmp_path):

@@ -126,14 +126,3 @@ def test_seeding_covers_every_generator():
         return random.random(), np.random.rand(), torch.rand(1).item()
 
     assert draw() == draw()
-
-
-def test_the_command_is_the_same_wherever_the_repository_lies(monkeypatch):
-    monkeypatch.setattr("sys.argv", ["/somewhere/recipes/expert.py", "--task", "bin_dropping"])
-    assert runs.command_line() == "python recipes/expert.py --task bin_dropping"
-
-
-def test_only_what_still_has_its_default_is_replaced():
-    config = Settings(steps=7)
-    runs.replace_defaults(config, {"steps": 1, "rate": 0.2})
-    assert (config.steps, config.rate) == (7, 0.2)

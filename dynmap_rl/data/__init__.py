@@ -11,7 +11,7 @@ _MODULES = {
     "compute_features": "features",
     "describe_foreign": "foreign",
     "differentiate": "dynamics",
-    "find_dataset": "loading",
+    "find_dataset": "reading",
     "keep_episode": "human",
     "load_dataset": "loading",
     "load_foreign": "foreign",

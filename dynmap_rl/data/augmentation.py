@@ -69,7 +69,7 @@ def add_distractors(windows: TensorDictBase, generator: torch.Generator, most: i
     tell objects that it does not know from cart and block. Windows must be drawn on one background colour.
     """
     pixels = windows["pixels"]
-    background = pixels[:, 0].flatten(2).mode(2).values[:, None, :, None]  # (B, 1, 3, 1)
+    background = _most_frequent(pixels[:, 0].flatten(2))[:, None, :, None]  # (B, 1, 3, 1)
     bars = _draw_bars(len(pixels), most, pixels.shape[-1], generator).flatten(1)  # (B, 64 * 64)
     # Only where a bar may be: a fixed number of places, of which the first are the bars'.
     places = min(most * THICKEST * LONGEST, bars.shape[1])
@@ -80,6 +80,12 @@ def add_distractors(windows: TensorDictBase, generator: torch.Generator, most: i
     colors = _draw_colors(len(pixels), generator)[:, None, :, None]
     painted = pixels.flatten(3).scatter(3, place, torch.where(painted, colors, there))
     return windows.clone(False).set("pixels", painted.view_as(pixels))
+
+
+def _most_frequent(values: torch.Tensor) -> torch.Tensor:
+    """That of the last axis, of uint8 ``[B, C, N]``; ``torch.mode`` would wait for a GPU."""
+    counts = torch.zeros(*values.shape[:2], 256, dtype=torch.int32, device=values.device)
+    return counts.scatter_add_(2, values.long(), counts.new_ones(()).expand_as(values)).argmax(2).byte()
 
 
 def _draw_bars(batch: int, most: int, size: int, generator: torch.Generator) -> torch.Tensor:

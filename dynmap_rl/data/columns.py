@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,7 @@ import pyarrow.parquet as pq
 
 from dynmap_rl.runs import read_json, write_json
 
+from .reading import spans
 from .writing import quiet
 
 
@@ -121,9 +121,3 @@ def _link(file: Path, target: Path) -> None:
         os.link(file.resolve(), target)
     except OSError:
         shutil.copy2(file, target)
-
-
-def spans(episode: np.ndarray) -> list[tuple[int, slice]]:
-    """Each episode's index, and its rows."""
-    borders = [0, *(np.flatnonzero(np.diff(episode)) + 1).tolist(), len(episode)]
-    return [(int(episode[a]), slice(a, b)) for a, b in pairwise(borders)]

@@ -10,9 +10,9 @@ import numpy as np
 
 from dynmap_rl.modules import DYNAMICS
 
-from .columns import spans, write_columns
+from .columns import write_columns
 from .frames import choose_camera, iterate_frames
-from .loading import _read_column, _read_info, _read_table, find_dataset
+from .reading import find_dataset, read_column, read_info, read_table, spans
 from .tracking import WIDEST, track_centroid
 
 METHODS = ("central", "savgol")
@@ -91,7 +91,7 @@ def add_dynamics(
         OSError: the folder cannot be written.
     """
     root, output = find_dataset(dataset), Path(output).expanduser()
-    info = _read_info(root)
+    info = read_info(root)
     old = [name for q in DYNAMICS if (name := f"dynamics.{q}") in info["features"]]
     if old and not replace:
         raise ValueError(f"{root} has {', '.join(old)} already; --replace derives them anew")
@@ -99,10 +99,10 @@ def add_dynamics(
     _check_method(method, window, order)
     columns = _check_columns(root, info, state, columns, angles) if not track else None
     camera = choose_camera(root, info, camera) if track else None
-    table = _read_table(root, info, list({"timestamp", *old, *([] if track else [state])}))
+    table = read_table(root, info, list({"timestamp", *old, *([] if track else [state])}))
 
     def read(name: str, dtype=np.float64) -> np.ndarray:
-        return _read_column(root, name, table[name], dtype).numpy().reshape(len(table), -1)
+        return read_column(root, name, table[name], dtype).numpy().reshape(len(table), -1)
 
     if track:
         names, angles, tracks = ["x", "y"], [], _track(root, info, camera, threshold)

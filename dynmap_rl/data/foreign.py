@@ -14,10 +14,10 @@ from tensordict import TensorDict
 
 from dynmap_rl.modules import DYNAMICS
 
-from .columns import spans
 from .dynamics import entry_names, parse_entries
 from .frames import choose_camera, iterate_frames
-from .loading import FRAME_SHAPE, _read_column, _read_info, _read_table, find_dataset
+from .loading import FRAME_SHAPE
+from .reading import find_dataset, read_column, read_info, read_table, spans
 
 NO_TASK = "none"  # what --task names where the dataset is of no task of ours
 LONGEST = 120  # steps of a piece: longer ones make batches of whole pieces slow
@@ -41,7 +41,7 @@ def describe_foreign(
         ValueError: there is no such dataset, or it lacks something.
     """
     root = find_dataset(dataset)
-    info = _read_info(root)
+    info = read_info(root)
     features = info["features"]
     if "action" not in features:
         raise ValueError(f"{root} has no column 'action'; only demonstrations can be imitated")
@@ -90,9 +90,9 @@ def load_foreign(
         for q in layout["names"]
     }
     goal_column, entries = layout["goal"] or ("action", [])
-    table = _read_table(root, info, list({*columns.values(), goal_column}))
+    table = read_table(root, info, list({*columns.values(), goal_column}))
     numbers = {
-        key: _read_column(root, name, table[name]).reshape(len(table), -1)
+        key: read_column(root, name, table[name]).reshape(len(table), -1)
         for key, name in (columns | {"goal": goal_column}).items()
     }
     numbers["goal"] = numbers["goal"][:, entries]

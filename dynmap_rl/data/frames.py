@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import pyarrow.parquet as pq
 
 from dynmap_rl.hub import first_line
 
-from .columns import spans
+from .reading import decode_image, spans
 
 TOLERANCE = 1e-4  # s, LeRobot's own, between a timestamp and the video's frame
 BLOCK = 100  # frames decoded at a time: full-sized ones of a whole episode may not fit into memory
@@ -52,12 +53,15 @@ def iterate_frames(
     """
     episodes = _read_episodes(root) if info["features"][camera]["dtype"] == "video" else None
     columns = ["episode_index", "timestamp", *([] if episodes else [camera])]
+    largest = math.prod(info["features"][camera]["shape"])
     for file in sorted((root / "data").glob("*/*.parquet")):
         table = _read(file, columns)
         for episode, span in spans(table["episode_index"].to_numpy()):
             rows = table.slice(span.start, span.stop - span.start)
             blocks = (
-                _decode_video(root, info, episodes, camera, rows) if episodes else _decode(file, camera, rows)
+                _decode_video(root, info, episodes, camera, rows)
+                if episodes
+                else _decode(file, camera, rows, largest)
             )
             frames = []
             for block in blocks:
@@ -80,18 +84,18 @@ def _read_episodes(root: Path) -> dict[int, dict]:
     return {r["episode_index"]: r for f in files for r in _read(f, ["episode_index", *names]).to_pylist()}
 
 
-def _decode(file: Path, camera: str, rows: pa.Table) -> Iterator[list[np.ndarray]]:
+def _decode(file: Path, camera: str, rows: pa.Table, largest: int) -> Iterator[list[np.ndarray]]:
     images = rows[camera].combine_chunks().field("bytes")
     for start in range(0, len(images), BLOCK):
         block = []
         for row in range(start, min(start + BLOCK, len(images))):
-            data = np.frombuffer(images[row].as_buffer() or b"", np.uint8)
-            block.append(cv2.imdecode(data, cv2.IMREAD_COLOR_RGB) if data.size else None)
-            if block[-1] is None:
+            try:
+                block.append(decode_image(images[row].as_buffer(), largest))
+            except ValueError as error:
                 episode = rows["episode_index"][0].as_py()
                 raise ValueError(
-                    f"{file}: frame {row} of episode {episode} cannot be decoded; restore the dataset"
-                )
+                    f"{file}: frame {row} of episode {episode} {error}; restore the dataset"
+                ) from error
         yield block
 
 

@@ -9,10 +9,11 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 
+from dynmap_rl.commands import command_line
 from dynmap_rl.data import describe_foreign
 from dynmap_rl.modules import WorldModel
 from dynmap_rl.objectives import imitation_loss
-from dynmap_rl.runs import command_line, write_json
+from dynmap_rl.runs import write_json
 from dynmap_rl.training import prediction_errors
 
 from .html import write_html

@@ -9,10 +9,11 @@ import numpy as np
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
+from dynmap_rl.commands import command_line
 from dynmap_rl.data import NO_TASK, load_meta
 from dynmap_rl.envs import scene_seed
 from dynmap_rl.modules import Actor, WorldModel, load_policy
-from dynmap_rl.runs import command_line, read_json, write_json
+from dynmap_rl.runs import read_json, write_json
 
 from .held_out import held_out_text, write_held_out
 from .html import write_html

@@ -147,24 +147,23 @@ def empty_row(root):
     rewrite(root, change)
 
 
-def broken_frame(root):
-    def change(table):
-        frames = table[CAMERA].to_pylist()
-        frames[3]["bytes"] = frames[3]["bytes"][:20]
-        return replace_column(table, CAMERA, pa.array(frames, table.schema.field(CAMERA).type))
+def another_frame(make, name):
+    def damage(root):
+        def change(table):
+            frames = table[CAMERA].to_pylist()
+            frames[3]["bytes"] = make(frames[3]["bytes"])
+            return replace_column(table, CAMERA, pa.array(frames, table.schema.field(CAMERA).type))
 
-    rewrite(root, change)
+        rewrite(root, change)
+
+    damage.__name__ = name
+    return damage
 
 
-def small_frame(root):
+def blank(height, width, kind=".png"):
     import cv2
 
-    def change(table):
-        frames = table[CAMERA].to_pylist()
-        frames[3]["bytes"] = cv2.imencode(".png", np.zeros((32, 64, 3), np.uint8))[1].tobytes()
-        return replace_column(table, CAMERA, pa.array(frames, table.schema.field(CAMERA).type))
-
-    rewrite(root, change)
+    return cv2.imencode(kind, np.zeros((height, width, 3), np.uint8))[1].tobytes()
 
 
 @pytest.mark.parametrize(
@@ -182,8 +181,16 @@ def small_frame(root):
         (unequal_lengths, "of 119 to 120 steps"),
         (nan, "action that are missing or not finite"),
         (empty_row, "next.reward that are missing or not finite"),
-        (broken_frame, "frame 3 cannot be decoded"),
-        (small_frame, r"frame 3 is \(32, 64, 3\)"),
+        (another_frame(lambda png: png[:20], "broken_frame"), "frame 3 cannot be decoded"),
+        (another_frame(lambda png: png[:40], "truncated_frame"), "frame 3 cannot be decoded"),
+        (another_frame(lambda png: b"", "no_frame"), "frame 3 cannot be decoded"),
+        (another_frame(lambda png: blank(32, 64), "small_frame"), r"frame 3 is \(32, 64, 3\)"),
+        (another_frame(lambda png: blank(1, 64), "one_line"), r"frame 3 is \(1, 64, 3\)"),
+        (
+            another_frame(lambda png: blank(4000, 3000), "huge_frame"),
+            "frame 3 has 3000 x 4000 pixels, more than",
+        ),
+        (another_frame(lambda png: blank(400, 300, ".jpg"), "huge_jpeg"), "frame 3 has 300 x 400 pixels"),
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )

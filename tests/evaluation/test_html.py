@@ -81,7 +81,7 @@ def open_in_browser(page, picture):
         [sys.executable, BROWSER, page, picture], capture_output=True, text=True, timeout=200
     )
     if "ModuleNotFoundError" in result.stderr or "cannot open shared object file" in result.stderr:
-        pytest.skip(f"pip install 'dynmap_rl[browser]', and what it needs: {result.stderr.splitlines()[-1]}")
+        pytest.skip(f"pip install '.[browser]', and what it needs: {result.stderr.splitlines()[-1]}")
     assert result.returncode == 0, result.stderr
     return json.loads(result.stdout)
 

@@ -1,10 +1,13 @@
 """The grid of the paper's tables: its cells, its runs, and what is printed of its results."""
 
+import importlib
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import commands
@@ -96,6 +99,26 @@ def test_a_cell_that_fails_says_where_to_look_and_the_others_go_on(tmp_path):
     assert "bin_dropping_joint_none_recurrent waits for its world model" in result.stderr
     assert "joint_none_recurrent.log, which ends with: error: " in result.stderr
     assert "holds a run with other settings" in result.stderr
+
+
+def test_ctrl_c_begins_no_other_cell(monkeypatch):
+    begun = []
+
+    def run_cell(cell, config, root):
+        begun.append(cell)
+        time.sleep(0.2)
+        os.kill(os.getpid(), signal.SIGINT)  # as a terminal sends it to all of its processes
+        time.sleep(0.2)
+
+    recipe = importlib.import_module("recipes.tables")
+    monkeypatch.setattr(recipe, "run_cell", run_cell)
+    previous = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            recipe.launch(list_cells(), recipe.Config())
+    finally:
+        signal.signal(signal.SIGINT, previous)
+    assert len(begun) == 1
 
 
 @pytest.mark.parametrize(
