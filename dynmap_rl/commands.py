@@ -11,6 +11,7 @@ import difflib
 import errno
 import os
 import re
+import shlex
 import sys
 from pathlib import Path
 
@@ -72,7 +73,7 @@ def read_arguments(given: list[str], config_class) -> list[str]:
             argument = name + equals + value
         arguments.append(argument)
         flag = argument in fields and fields[argument].type in (bool, "bool")
-        if flag and given[i + 1 : i + 2] not in (["true"], ["false"]):
+        if flag and "".join(given[i + 1 : i + 2]).lower() not in ("true", "false"):
             arguments.append("true")
     return arguments
 
@@ -92,9 +93,11 @@ def describe_error(error: Exception) -> str | None:
 
 
 def replace_defaults(config, values: dict) -> None:
-    """Set those fields of a dataclass that still have their default: what was asked for stays."""
+    """Set those fields of a dataclass that still have their default and are not on the command line: what was asked
+    for stays."""
+    given = {a.partition("=")[0][2:].replace("-", "_") for a in sys.argv[1:] if a.startswith("--")}
     for name, value in values.items():
-        if getattr(config, name) == getattr(type(config), name):
+        if name not in given and getattr(config, name) == getattr(type(config), name):
             setattr(config, name, value)
 
 
@@ -107,4 +110,4 @@ def check_at_least_one(config, *names: str) -> None:
 
 def command_line() -> str:
     """The command that started this process, as it would be given in the root of the repository."""
-    return " ".join(["python", f"recipes/{Path(sys.argv[0]).name}", *sys.argv[1:]])
+    return shlex.join(["python", f"recipes/{Path(sys.argv[0]).name}", *sys.argv[1:]])

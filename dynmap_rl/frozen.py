@@ -19,20 +19,28 @@ from dynmap_rl.modules import Actor, WorldModel
 from dynmap_rl.training import fingerprint, train_policy
 
 
-def load_source(run: Path) -> tuple[WorldModel, dict[str, str]]:
+def load_source(run: str | Path) -> tuple[WorldModel, dict[str, str]]:
     """The world model of a finished run, and where it is from: ``task`` and ``training`` (decoupled or joint).
 
     Args:
-        run: its folder, or the ``world_model`` in it.
+        run: its folder, or the ``world_model`` in it; its id on the hub; or the name of a run that ships with the
+            package (see :func:`dynmap_rl.modules.find_run`).
 
     Raises:
         ValueError: the folder is no such run, or it is not done.
     """
+    run = modules.find_run(str(run))
     run = run.parent if run.name == "world_model" else run
     source = runs.read_json(run / "eval.json").get("world_model") if (run / "eval.json").exists() else None
     if source is None:
         raise ValueError(f"{run} holds no finished run; train a world model with recipes/decoupled.py first")
     return modules.load_world_model(run / "world_model"), source
+
+
+def check_same(world_model: WorldModel, result: dict, folder: Path) -> None:
+    """Raises ``ValueError`` where the result of a run was made with another world model."""
+    if result["world_model_sha256"] != fingerprint(world_model):
+        raise ValueError(f"{folder} was made with another world model; choose another --run, or delete it")
 
 
 def train_policies(

@@ -141,11 +141,12 @@ def truncate_metrics(folder: Path, step: int) -> None:
 
 
 def save_training_state(path: Path, **state) -> None:
-    """Save tensors and plain values, with the state of torch's generator, atomically."""
+    """Save tensors and plain values, with the states of torch's generators, atomically."""
     import torch
 
     buffer = io.BytesIO()
-    torch.save({**state, "rng": torch.get_rng_state()}, buffer)
+    gpu = {"gpu_rng": torch.cuda.get_rng_state()} if torch.cuda.is_initialized() else {}
+    torch.save({**state, **gpu, "rng": torch.get_rng_state()}, buffer)
     write_bytes(path, buffer.getbuffer())
 
 
@@ -162,6 +163,9 @@ def load_training_state(path: Path) -> dict | None:
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
         torch.set_rng_state(state.pop("rng"))
+        gpu = state.pop("gpu_rng", None)
+        if gpu is not None and torch.cuda.is_available():
+            torch.cuda.set_rng_state(gpu)
     except Exception as error:
         raise ValueError(f"{path} cannot be read ({error}); delete it to train from the start") from error
     return state

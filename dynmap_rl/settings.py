@@ -50,6 +50,9 @@ def check_settings(settings) -> list[int]:
         raise ValueError(f"there are {SHARED_STARTS} shared start states, not {settings.test_episodes}")
     numbers = "updates", "windows", "rgb_steps", "policy_updates", "policy_batch", "threads"
     commands.check_at_least_one(settings, *numbers, "test_episodes", "paper_episodes")
+    for name in ("copies", "distractors", "emphasis", "beta_z", "beta_dynamics", "beta_joint"):
+        if (value := getattr(settings, name, 0)) < 0:
+            raise ValueError(f"--{name} must not be negative, not {value}")
     if not 2 <= (steps := getattr(settings, "window_steps", 2)) <= EPISODE_STEPS:
         raise ValueError(f"--window_steps must be 2 to {EPISODE_STEPS}, not {steps}")
     if foreign:
@@ -61,16 +64,34 @@ def check_settings(settings) -> list[int]:
         raise ValueError(
             "--camera and --goal are for --task none; our own tasks have one camera and their goal"
         )
-    elif settings.dataset and (task := data.load_meta(settings.dataset)["task"]) != settings.task:
-        raise ValueError(f"{settings.dataset} is of {task}, not of {settings.task}; choose another --dataset")
+    elif settings.dataset:
+        check_dataset(settings.dataset, settings.task)
     return seeds
 
 
+def check_dataset(dataset: str | Path, task: str) -> None:
+    """Raises ``ValueError`` for a dataset that is of another task, or of no demonstrations: there is nothing to imitate."""
+    meta = data.load_meta(dataset)
+    if meta["task"] != task:
+        raise ValueError(f"{dataset} is of {meta['task']}, not of {task}; choose another --dataset")
+    if meta["kind"] == "exploration":
+        raise ValueError(
+            f"{dataset} is of exploration, which is not to be imitated; choose another --dataset"
+        )
+
+
 def find_or_record(settings) -> str | Path:
-    """The dataset of the settings, or ``datasets/TASK``, recorded if it is not there (six episodes for a smoke run)."""
+    """The dataset of the settings, or ``datasets/TASK``, recorded if it is not there (six episodes for a smoke run).
+
+    Raises:
+        ValueError: ``datasets/TASK`` is of another task, or of no demonstrations.
+    """
     if settings.dataset:
         return settings.dataset
     folder = Path("datasets") / get_task(settings.task).name
+    if not settings.smoke and (folder / data.META).exists():
+        check_dataset(folder, settings.task)
+        return folder
     if settings.smoke:
         folder = folder.with_name(f"{folder.name}_smoke")
         return data.record_dataset(folder, settings.task, episodes=4, eval_episodes=2, workers=1)

@@ -147,11 +147,12 @@ def _fit(
             losses = loss_module(windows)
         norm = step(sum(losses.values()), optimizer)
         done = update + 1
-        if done % 50 == 0 or done in (1, settings.updates):
+        saved = done % save_every == 0 or done == settings.updates
+        if saved or done % 50 == 0 or done == 1:
             losses = {name: value.item() for name, value in losses.items()}
             first = check_loss(sum(losses.values()), norm, first)
             progress.set_postfix({k.removeprefix("loss_"): f"{v:.3f}" for k, v in losses.items()})
-        if done % save_every == 0 or done == settings.updates:
+        if saved:
             log_metrics(folder, done, settings.logger, **losses, **held_out())
             runs.save_training_state(
                 path,

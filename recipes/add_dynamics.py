@@ -15,25 +15,30 @@ from dynmap_rl.commands import run_recipe
 
 @dataclass
 class Config:
-    # Dataset: a folder or a hub id.
+    # Dataset: a folder or a hub id. Must be given.
     dataset: str | None = None
-    # Folder of the new dataset.
+    # Folder of the new dataset. Must be given.
     output: Path | None = None
-    # Column whose entries are positions, and which of its entries (0,1,2); by default all.
+    # Column whose entries are positions.
     state: str = "observation.state"
+    # Which of its entries, such as 0,1,2; by default all.
     columns: str | None = None
-    # Those of the entries that are angles and jump by a period, and the period: 6.2832 (rad) or 360 (degrees).
+    # Those of the entries that are angles and jump by a period.
     angles: str | None = None
+    # The period: 6.2832 (rad) or 360 (degrees).
     period: float = 6.283185307179586
-    # Derivatives: central (differences over both neighbours) or savgol (for noisy positions at even timestamps), with
-    # the steps of its window and the order of its polynomial.
+    # Derivatives: central (differences over both neighbours) or savgol (for noisy positions at even timestamps).
     method: str = "central"
+    # Steps of savgol's window.
     window: int = 11
+    # Order of savgol's polynomial.
     order: int = 3
     # Take positions from the frames instead: the centroid, in pixels, of what moves (see dynmap_rl/data/tracking.py for
-    # what it cannot do); in which camera, by default the first; and how much of 255 a pixel must change.
+    # what it cannot do).
     track: bool = False
+    # In which camera; by default the first.
     camera: str | None = None
+    # How much of 255 a pixel must change to count as moving.
     threshold: int = 30
     # Replace dynamics columns that are there, and say how far the new ones are from them.
     replace: bool = False
@@ -44,6 +49,12 @@ def main(config: Config) -> None:
 
     if not config.dataset or not config.output:
         raise ValueError("name the dataset with --dataset and the new folder with --output")
+    of_state, of_frames = ("state", "columns", "angles", "period"), ("camera", "threshold")
+    for name in of_state if config.track else of_frames:
+        if getattr(config, name) != getattr(Config, name):
+            raise ValueError(
+                f"--{name} says nothing {'with' if config.track else 'without'} --track; leave it out"
+            )
     settings = vars(config) | {
         "columns": parse_entries(config.columns, "--columns"),
         "angles": parse_entries(config.angles, "--angles") or [],

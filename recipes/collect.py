@@ -19,8 +19,9 @@ class Config:
     task: str = "balance_reaching"
     # demonstrations (successful episodes only) or exploration (noisy experts on detours, all episodes).
     kind: str = "demonstrations"
-    # Episodes of the splits train and eval.
+    # Episodes of the split train.
     episodes: int = 300
+    # Episodes of the split eval, held out.
     eval_episodes: int = 50
     # Folder of the dataset; by default datasets/TASK, or datasets/TASK_exploration.
     output: Path | None = None
@@ -33,8 +34,7 @@ class Config:
 
 
 def main(config: Config) -> None:
-    from dynmap_rl.data import push_dataset, record_dataset
-    from dynmap_rl.data.loading import META
+    from dynmap_rl.data import META, push_dataset, record_dataset
     from dynmap_rl.envs.tasks import get_task
 
     suffix = "" if config.kind == "demonstrations" else f"_{config.kind}"

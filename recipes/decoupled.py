@@ -24,42 +24,54 @@ class Config:
     supervision: str = "position,velocity"
     # Policy: feedforward or recurrent.
     policy: str = "recurrent"
-    # Seeds of the policies, and of the world model.
+    # Seeds of the policies.
     seeds: str = "0,1,2"
+    # Seed of the world model.
     world_model_seed: int = 0
     # Dataset: a folder or a hub id; by default datasets/TASK, recorded if it is not there.
     dataset: str | None = None
-    # With --task none: the camera's column, by default the first, and the goal's column and entries, such as
-    # observation.state:3,4, by default no goal.
+    # With --task none: the camera's column; by default the first.
     camera: str | None = None
+    # With --task none: the goal's column and entries, such as observation.state:3,4; by default no goal.
     goal: str | None = None
     # Run folder; by default runs/decoupled/TASK/SUPERVISION_POLICY.
     run: Path | None = None
-    # Run folder whose world model is taken, of the same task and supervision; by default one is trained here.
+    # Run folder whose world model is taken, its id on the hub, or balance_reaching, which ships with the package: of the
+    # same task and supervision. By default one is trained here.
     world_model: Path | None = None
-    # World model: optimiser steps, windows a step, steps a window, decoded frames a window, peak learning rate.
+    # Optimiser steps of the world model.
     updates: int = 2500
+    # Windows a step.
     windows: int = 16
+    # Time steps a window.
     window_steps: int = 24
+    # Frames decoded a window, drawn at random.
     rgb_steps: int = 8
+    # Peak learning rate of the world model (100 steps of warm-up, then a cosine).
     learning_rate: float = 2e-3
+    # Weight of the latent's loss (Eq. 4a).
     beta_z: float = 0.1
+    # Weight of the loss of every supervised quantity (Eq. 5).
     beta_dynamics: float = 1.0
     # Bars painted on the background of a window, at most (see dynmap_rl.data.add_distractors); 0 for none.
     distractors: int = 3
     # Spatial-softmax keypoints beside the plain CNN's features (beyond the paper).
     keypoints: bool = False
-    # Policy: optimiser steps, episodes a step, augmented copies of every demonstration, peak learning rate.
+    # Optimiser steps of a policy.
     policy_updates: int = 2500
+    # Episodes a step.
     policy_batch: int = 32
+    # Recoloured copies of every demonstration, beside it.
     copies: int = 2
+    # Peak learning rate of a policy (100 steps of warm-up, then a cosine).
     policy_learning_rate: float = 3e-3
     # Weight of the steps in which the expert changes its action (see imitation_loss); 0 for the paper's plain L1.
     emphasis: float = 60.0
-    # Evaluation: scenes of the paper's protocol, shared start states, and the split they are of: test, or validation
-    # for choosing settings.
+    # Scenes to evaluate on: those of test, or of validation while you choose settings.
     split: str = "test"
+    # Scenes of the paper's protocol.
     paper_episodes: int = 50
+    # Scenes that all policies of the tables share, 1,000 at most.
     test_episodes: int = 1000
     # Every stage in a minimal size, for tests.
     smoke: bool = False
@@ -71,6 +83,10 @@ class Config:
     logger: str | None = None
 
 
+WORLD_MODEL = (  # what says nothing where the world model is there
+    "world_model_seed", "updates", "windows", "window_steps", "rgb_steps", "learning_rate", "beta_z", "beta_dynamics",
+    "distractors", "keypoints",
+)  # fmt: skip
 SMOKE = {
     "updates": 4, "windows": 2, "window_steps": 6, "rgb_steps": 2, "policy_updates": 3, "policy_batch": 2,
     "copies": 1, "paper_episodes": 2, "test_episodes": 3, "seeds": "0",
@@ -84,6 +100,9 @@ def main(config: Config) -> None:
     from dynmap_rl.evaluation import parse_supervision, print_row, write_report
     from dynmap_rl.training import train_world_model
 
+    given = [name for name in WORLD_MODEL if getattr(config, name) != getattr(Config, name)]
+    if config.world_model and given:
+        raise ValueError(f"--{given[0]} is of a world model's training, and that of --world_model is done")
     if config.smoke:
         replace_defaults(config, SMOKE)
     if config.task == data.NO_TASK:
@@ -102,8 +121,11 @@ def main(config: Config) -> None:
     folder = config.run or Path("runs/decoupled") / settings.name_task(config) / name
     folder = runs.open_run(folder, config, ignore=("run", "threads", "device", "logger"))
     if (folder / "eval.json").exists():
+        result = runs.read_json(folder / "eval.json")
+        if trained:
+            frozen.check_same(trained, result, folder)
         print(f"{folder} is done; delete it to run again")
-        return print_row(runs.read_json(folder / "eval.json"))
+        return print_row(result)
     torch.set_num_threads(config.threads)
 
     dataset = settings.find_or_record(config)

@@ -26,19 +26,23 @@ class Config:
     dataset: str | None = None
     # Run folder; by default runs/end_to_end/TASK/POLICY.
     run: Path | None = None
-    # Optimiser steps, windows a step, steps a window, peak learning rate.
+    # Optimiser steps.
     updates: int = 2500
+    # Windows a step.
     windows: int = 8
+    # Time steps a window.
     window_steps: int = 48
+    # Peak learning rate (100 steps of warm-up, then a cosine).
     learning_rate: float = 2e-3
     # Weight of the steps in which the expert changes its action (see imitation_loss); 0 for the paper's plain L1.
     emphasis: float = 60.0
     # Bars painted on the background of a window, at most (see dynmap_rl.data.add_distractors); 0 for none.
     distractors: int = 3
-    # Evaluation: scenes of the paper's protocol, shared start states, and the split they are of: test, or validation
-    # for choosing settings.
+    # Scenes to evaluate on: those of test, or of validation while you choose settings.
     split: str = "test"
+    # Scenes of the paper's protocol.
     paper_episodes: int = 50
+    # Scenes that all policies of the tables share, 1,000 at most.
     test_episodes: int = 1000
     # Every stage in a minimal size, for tests.
     smoke: bool = False
@@ -78,7 +82,7 @@ def main(config: Config) -> None:
     held_out = data.load_dataset(dataset, "eval")
     result = write_report(folder, config, dataset, world_model, held_out, seeds, source=source)
     print_row(result)
-    print(f"figures, rollouts and eval.json are in {folder}")
+    print(f"eval.json and all else is in {folder}")
 
 
 if __name__ == "__main__":

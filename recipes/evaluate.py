@@ -32,8 +32,9 @@ class Config:
     expert: str | None = None
     # Its checkpoint; by default the last.
     checkpoint: str | None = None
-    # Scenes, and the split they are of.
+    # Number of scenes.
     episodes: int = 1000
+    # Split that they are of: test, or validation while you choose settings.
     split: str = "test"
     # JSON file; by default one in runs/evaluate.
     output: Path | None = None
@@ -57,13 +58,10 @@ def judge_policy(config: Config) -> tuple[str, dict]:
     """The name of the result, and the result: ``DR``, ``PE``, ``SR`` and what became of every episode."""
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.evaluation import evaluate
-    from dynmap_rl.modules import find_run, load_actor
-    from dynmap_rl.runs import read_json
+    from dynmap_rl.modules import find_run, load_actor, task_of_run
 
     folder = find_run(config.policy)
-    facts = folder / "config.json"
-    settings = read_json(facts) if facts.exists() else {}
-    task = config.task or settings.get("task", "balance_reaching")
+    task = config.task or task_of_run(folder) or "balance_reaching"
     description = get_task(task, from_file=not config.task).description
     if not folder.exists():
         raise ValueError(f"there is no policy at {config.policy}; train one with recipes/decoupled.py")
@@ -102,19 +100,12 @@ def judge_expert(config: Config) -> tuple[str, dict]:
     from dynmap_rl.envs.scene import ObstacleScene
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.evaluation import scene_seeds, wilson
-    from dynmap_rl.experts import find_expert, list_checkpoints, load_expert, roll_out
-    from dynmap_rl.runs import read_json
+    from dynmap_rl.experts import list_checkpoints, load_expert, roll_out, task_of_expert
 
     task = get_task(config.task or "balance_reaching")
     expert = config.expert or task.name
     checkpoint = config.checkpoint or list_checkpoints(expert)[-1]
-    network = load_expert(expert, checkpoint)
-    facts = read_json(find_expert(expert) / f"{checkpoint}.json")
-    trained_on = get_task(facts["task"], from_file=True)
-    if not issubclass(task.ranges.scene, trained_on.ranges.scene):
-        raise ValueError(
-            f"the expert {expert} sees states of {trained_on.name}, which {task.name} does not have"
-        )
+    network, trained_on = load_expert(expert, checkpoint), task_of_expert(expert, task)
     worlds = roll_out(network, task, scene_seeds(config.split, config.episodes), states=trained_on)
     outcomes = {
         "success": [task.is_success(world) for world in worlds],
@@ -130,7 +121,8 @@ def judge_expert(config: Config) -> tuple[str, dict]:
         low, high = intervals[name]
         print(f"{name.replace('_', ' '):22} {rate:5.1f} % [{low:.1f}, {high:.1f}]")
     result = {"task": config.task or task.name, "expert": expert, "checkpoint": checkpoint}
-    return f"{task.name}_{trained_on.name}_{checkpoint}", result | {"rates": rates, "intervals": intervals}
+    name = "_".join([task.name, *Path(expert).parts[-4:], checkpoint]).replace("/", "")
+    return name, result | {"rates": rates, "intervals": intervals}
 
 
 if __name__ == "__main__":

@@ -18,17 +18,25 @@ class Config:
     task: str = "balance_reaching"
     # Run folder; by default runs/expert/TASK.
     run: Path | None = None
+    # Seed of everything random.
     seed: int = 0
     # Worlds stepped together; each iteration runs one episode's length in all of them.
     num_envs: int = 64
+    # Iterations: rollouts and the updates from them.
     iterations: int = 45
     # Passes over each iteration's frames.
     epochs: int = 10
+    # Frames an optimiser step.
     minibatch: int = 1024
+    # Learning rate at first; it falls to a tenth.
     learning_rate: float = 5e-4
+    # Discount of a step.
     gamma: float = 0.97
+    # Lambda of the generalised advantage estimates.
     gae_lambda: float = 0.95
+    # Limit of PPO's ratio.
     clip: float = 0.2
+    # Weight of the entropy.
     entropy: float = 1e-3
     # Iterations between checkpoints.
     checkpoint_every: int = 5
@@ -36,6 +44,7 @@ class Config:
     eval_episodes: int = 200
     # Fresh scenes for the last checkpoint.
     final_episodes: int = 1000
+    # Torch's threads.
     threads: int = 2
     # Metrics to tensorboard, wandb or trackio as well, where it is installed.
     logger: str | None = None
@@ -57,7 +66,9 @@ def main(config: Config) -> None:
     torch.set_num_threads(config.threads)
     env = DynmapBatchedEnv(config.task, config.num_envs, control="acceleration")
     folder = runs.open_run(
-        config.run or Path("runs/expert") / env.task.name, config, ignore=("iterations", "threads", "logger")
+        config.run or Path("runs/expert") / env.task.name,
+        config,
+        ignore=("run", "iterations", "threads", "logger"),
     )
     runs.seed_everything(config.seed)
     network = ExpertNetwork(env.task.state_size, tuple(ACCELERATION_LIMIT))

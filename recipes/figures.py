@@ -84,12 +84,10 @@ def is_done(run: Path) -> bool:
 
 
 def how_to_run(config: Config, cells: list[str]) -> str:
-    """The command for the first of the cells, after that for the cell whose world model it takes."""
-    source = cells[0].replace("feedforward", "recurrent")
-    todo = [cell for cell in dict.fromkeys((source, cells[0])) if not is_done(config.runs / cell)]
-    commands = " and then ".join(f"python recipes/tables.py --only {cell}" for cell in todo)
-    others = f" ({len(cells) - 1} more: python recipes/tables.py)" if len(cells) > 1 else ""
-    return f"no finished run {config.runs / cells[0]}; run {commands}{others}"
+    """The command for the first of the cells."""
+    command = "python recipes/tables.py --results runs/results"
+    others = f" ({len(cells) - 1} more: without --only)" if len(cells) > 1 else ""
+    return f"no finished run {config.runs / cells[0]}; run {command} --only {cells[0]}{others}"
 
 
 def find_missing(config: Config, cells: list[str]) -> list[str]:

@@ -18,7 +18,7 @@ from dynmap_rl.commands import replace_defaults, run_recipe
 class Config:
     # Name of the task to learn: balance_reaching_obstacle, bin_dropping, or module:Class of your own.
     task: str = "balance_reaching_obstacle"
-    # Run folder that a world model was trained in.
+    # Run folder that a world model was trained in, its id on the hub, or balance_reaching, which ships with the package.
     world_model: Path = Path("runs/decoupled/balance_reaching/position_velocity_recurrent")
     # Policy: feedforward or recurrent.
     policy: str = "recurrent"
@@ -28,17 +28,21 @@ class Config:
     dataset: str | None = None
     # Run folder; by default runs/generalize/TASK/TRAINING_SUPERVISION_POLICY.
     run: Path | None = None
-    # Policy: optimiser steps, episodes a step, augmented copies of every demonstration, peak learning rate.
+    # Optimiser steps of a policy.
     policy_updates: int = 2500
+    # Episodes a step.
     policy_batch: int = 32
+    # Recoloured copies of every demonstration, beside it.
     copies: int = 2
+    # Peak learning rate of a policy (100 steps of warm-up, then a cosine).
     policy_learning_rate: float = 3e-3
     # Weight of the steps in which the expert changes its action (see imitation_loss); 0 for the paper's plain L1.
     emphasis: float = 60.0
-    # Evaluation: scenes of the paper's protocol, shared start states, and the split they are of: test, or validation
-    # for choosing settings.
+    # Scenes to evaluate on: those of test, or of validation while you choose settings.
     split: str = "test"
+    # Scenes of the paper's protocol.
     paper_episodes: int = 50
+    # Scenes that all policies of the tables share, 1,000 at most.
     test_episodes: int = 1000
     # Every stage in a minimal size, for tests.
     smoke: bool = False
@@ -58,10 +62,9 @@ SMOKE = {
 def main(config: Config) -> None:
     import torch
 
-    from dynmap_rl import data, frozen, runs, settings
+    from dynmap_rl import frozen, runs, settings
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.evaluation import print_row, write_report
-    from dynmap_rl.training import fingerprint
 
     if config.smoke:
         replace_defaults(config, SMOKE)
@@ -75,21 +78,17 @@ def main(config: Config) -> None:
     folder = runs.open_run(folder, config, ignore=("run", "threads", "device", "logger"))
     if (folder / "eval.json").exists():
         result = runs.read_json(folder / "eval.json")
-        if result["world_model_sha256"] != fingerprint(world_model):
-            raise ValueError(
-                f"{folder} was made with another world model; choose another --run, or delete it"
-            )
+        frozen.check_same(world_model, result, folder)
         print(f"{folder} is done; delete it to run again")
         return print_row(result)
     torch.set_num_threads(config.threads)
 
     dataset = settings.find_or_record(config)
-    constants = data.load_meta(dataset)["normalization"]
-    episodes = {split: data.load_dataset(dataset, split) for split in ("train", "eval")}
+    episodes, constants = settings.load_episodes(config, dataset)
     fingerprint = frozen.train_policies(world_model, episodes, constants, folder, config, seeds)
     result = write_report(folder, config, dataset, world_model, episodes["eval"], seeds, fingerprint, source)
     print_row(result)
-    print(f"figures, rollouts and eval.json are in {folder}")
+    print(f"eval.json and all else is in {folder}")
 
 
 if __name__ == "__main__":

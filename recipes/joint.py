@@ -27,30 +27,37 @@ class Config:
     seeds: str = "0,1,2"
     # Dataset: a folder or a hub id; by default datasets/TASK, recorded if it is not there.
     dataset: str | None = None
-    # With --task none: the camera's column, by default the first, and the goal's column and entries, such as
-    # observation.state:3,4, by default no goal.
+    # With --task none: the camera's column; by default the first.
     camera: str | None = None
+    # With --task none: the goal's column and entries, such as observation.state:3,4; by default no goal.
     goal: str | None = None
     # Run folder; by default runs/joint/TASK/SUPERVISION_POLICY.
     run: Path | None = None
-    # Optimiser steps, windows a step, steps a window, decoded frames a window, peak learning rate.
+    # Optimiser steps.
     updates: int = 2500
+    # Windows a step.
     windows: int = 8
+    # Time steps a window.
     window_steps: int = 48
+    # Frames decoded a window, drawn at random.
     rgb_steps: int = 16
+    # Peak learning rate (100 steps of warm-up, then a cosine).
     learning_rate: float = 2e-3
+    # Weight of the latent's loss (Eq. 4a).
     beta_z: float = 0.1
+    # Weight of the loss of every supervised quantity (Eq. 5).
     beta_dynamics: float = 1.0
-    # Weight of the policy's loss.
+    # Weight of the policy's loss (Eq. 4).
     beta_joint: float = 1.0
     # Weight of the steps in which the expert changes its action (see imitation_loss); 0 for the paper's plain L1.
     emphasis: float = 60.0
     # Bars painted on the background of a window, at most (see dynmap_rl.data.add_distractors); 0 for none.
     distractors: int = 3
-    # Evaluation: scenes of the paper's protocol, shared start states, and the split they are of: test, or validation
-    # for choosing settings.
+    # Scenes to evaluate on: those of test, or of validation while you choose settings.
     split: str = "test"
+    # Scenes of the paper's protocol.
     paper_episodes: int = 50
+    # Scenes that all policies of the tables share, 1,000 at most.
     test_episodes: int = 1000
     # Every stage in a minimal size, for tests.
     smoke: bool = False

@@ -16,7 +16,8 @@ from dynmap_rl.commands import check_at_least_one, command_line, replace_default
 
 @dataclass
 class Config:
-    # Run folder whose world model is taken, of recipes/decoupled.py or joint.py; of another task too.
+    # Run folder whose world model is taken, its id on the hub, or balance_reaching, which ships with the package; of
+    # another task too. Must be given.
     world_model: Path | None = None
     # Name of the task: balance_reaching, balance_reaching_obstacle, bin_dropping, or module:Class of your own.
     task: str = "balance_reaching"
@@ -24,17 +25,25 @@ class Config:
     expert: str | None = None
     # Run folder; by default runs/latent_ppo/TASK.
     run: Path | None = None
+    # Seed of everything random.
     seed: int = 0
     # Worlds stepped together; each iteration runs one episode's length in all of them.
     num_envs: int = 64
+    # Iterations: rollouts and the updates from them.
     iterations: int = 90
     # Passes over each iteration's frames.
     epochs: int = 10
+    # Frames an optimiser step.
     minibatch: int = 1024
+    # Learning rate at first; it falls to a tenth.
     learning_rate: float = 5e-4
+    # Discount of a step.
     gamma: float = 0.97
+    # Lambda of the generalised advantage estimates.
     gae_lambda: float = 0.95
+    # Limit of PPO's ratio.
     clip: float = 0.2
+    # Weight of the entropy.
     entropy: float = 1e-3
     # Width of the network's hidden layers.
     hidden: int = 128
@@ -46,6 +55,7 @@ class Config:
     final_episodes: int = 1000
     # Every stage in a minimal size, for tests.
     smoke: bool = False
+    # Torch's threads.
     threads: int = 2
     # Metrics to tensorboard, wandb or trackio as well, where it is installed.
     logger: str | None = None
@@ -80,8 +90,9 @@ def main(config: Config) -> None:
     world_model, source = frozen.load_source(config.world_model)
     world_model.requires_grad_(False)
     expert = experts.load_expert(config.expert or config.task)
+    sees = experts.task_of_expert(config.expert or config.task, task)
     folder = config.run or Path("runs/latent_ppo") / f"{task.name}{'_smoke' if config.smoke else ''}"
-    folder = runs.open_run(folder, config, ignore=("run", "iterations", "threads", "logger"))
+    folder = runs.open_run(folder, config, ignore=("run", "threads", "logger"))
     if (folder / "eval.json").exists():
         print(f"{folder} is done; delete it to run again")
         return print(result_text(runs.read_json(folder / "eval.json")))
@@ -101,7 +112,7 @@ def main(config: Config) -> None:
     train_ppo(env, network, folder, config, judge, facts)
     if fingerprint(world_model) != frozen_weights:
         raise ValueError("the frozen world model has changed; this run is not valid")
-    states = rates(task, experts.roll_out(expert, task, fresh_scenes(config.final_episodes)))
+    states = rates(task, experts.roll_out(expert, task, fresh_scenes(config.final_episodes), sees))
     result = {
         "task": config.task,
         "world_model_of": source,

@@ -25,8 +25,9 @@ class Config:
     # default the one that the policy was trained on, otherwise balance_reaching.
     task: str | None = None
     # Run folder of ours with world model and policy, its id on the hub, or balance_reaching, which ships with the
-    # package; and which of its policies.
+    # package.
     policy: str | None = None
+    # Which of the run's policies.
     seed: int = 0
     # Expert: the name of the task that it ships for, or a folder of checkpoints; by default the task's own.
     expert: str | None = None
@@ -40,27 +41,23 @@ class Config:
     push_to_hub: str | None = None
     # Side of the scene on the screen, in pixels.
     size: int = 384
-    # End after so many steps (for films); and an animation of the window as a GIF.
+    # End after so many steps (for films).
     steps: int | None = None
+    # An animation of the window, as a GIF.
     gif: Path | None = None
 
 
 def main(config: Config) -> None:
     from dynmap_rl.data import push_dataset
-    from dynmap_rl.data.human import list_shards, open_folder, publish_episodes
+    from dynmap_rl.data.human import list_shards, next_scene, open_folder, publish_episodes
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.envs.world import CONTROL_DT
-    from dynmap_rl.modules import find_run, load_actor
+    from dynmap_rl.modules import find_run, load_actor, task_of_run
     from dynmap_rl.play import PlayWindow, Session
-    from dynmap_rl.runs import read_json
 
-    trained_on, actor = None, None
-    if config.policy:
-        run = find_run(config.policy)
-        actor = load_actor(run, config.seed)
-        if (run / "config.json").exists():
-            trained_on = read_json(run / "config.json").get("task")
-    task = config.task or trained_on or "balance_reaching"
+    run = find_run(config.policy) if config.policy else None
+    task = config.task or (run and task_of_run(run)) or "balance_reaching"
+    actor = load_actor(run, config.seed) if run else None
     get_task(task, from_file=not config.task)
     if config.size < 64 or (config.steps is not None and config.steps < 1):
         raise ValueError("--size must be at least 64 and --steps at least 1")
@@ -68,14 +65,12 @@ def main(config: Config) -> None:
         raise ValueError("--gif needs --steps, the number of steps that the film shows")
     if config.push_to_hub and not config.record:
         raise ValueError("--push_to_hub needs --record, the folder of the demonstrations")
-    kept = 0
+    kept, first = 0, config.scene
     if config.record:
         open_folder(config.record, task)
-        kept = len(list_shards(config.record, task))
+        kept, first = len(list_shards(config.record, task)), first + next_scene(config.record, task)
     # Demonstrations are of scenes for training, and every session begins with new ones.
-    session = Session(
-        task, actor, config.expert, config.scene + kept, split="train" if config.record else "validation"
-    )
+    session = Session(task, actor, config.expert, first, split="train" if config.record else "validation")
     if config.driver:
         if config.driver not in session.drivers:
             raise ValueError(f"--driver is one of {', '.join(session.drivers)}, not {config.driver!r}")

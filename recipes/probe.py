@@ -16,15 +16,17 @@ from dynmap_rl.commands import command_line, run_recipe
 
 @dataclass
 class Config:
-    # Run folders with world models, separated by commas.
+    # Run folders with world models, ids on the hub, or balance_reaching, which ships; separated by commas.
     runs: str = "runs/decoupled/balance_reaching/position_velocity_recurrent"
     # Recorded dataset: a folder or a hub id; by default datasets/balance_reaching, recorded where it is not there.
     dataset: str | None = None
-    # Demonstrations that the linear maps are fitted to, and held-out ones.
+    # Demonstrations that the linear maps are fitted to.
     train_episodes: int = 100
+    # Held-out demonstrations that all is measured on.
     test_episodes: int = 50
-    # Steps of 50 ms: those with frames, and those that are predicted.
+    # Steps of 50 ms with frames, at first.
     context: int = 20
+    # Steps that are then predicted without.
     horizon: int = 40
     # Folder of the results.
     output: Path = Path("runs/probe")
@@ -41,7 +43,7 @@ def main(config: Config) -> None:
         raise ValueError("--train_episodes and --test_episodes must be at least 1")
     models = {}
     for run in config.runs.split(","):
-        world_model, source = load_source(Path(run.strip()))
+        world_model, source = load_source(run.strip())
         name = f"{row_name(world_model.supervision, source['training'])}, {source['training']}"
         if name in models:
             raise ValueError(f"--runs has {name} twice")

@@ -6,8 +6,10 @@
     python recipes/tables.py --launcher ray             # on a Ray cluster (pip install '.[ray]')
     python recipes/tables.py --print markdown           # or json: the tables from the results alone
 
-A cell is a run of another recipe; its result is a JSON in ``results``. World models are trained once and reused. A killed
-run loses at most what its cells in flight have not saved yet; the same command goes on.
+A cell is a run of another recipe; its result is a JSON in ``results``. Cells whose result is there are skipped, so that a
+grid of your own needs a folder of its own (``--results runs/results``). World models are trained once and reused; one that a
+cell needs and whose run is not there is trained first. A killed run loses at most what its cells in flight have not saved
+yet; the same command goes on.
 """
 
 import subprocess
@@ -16,32 +18,36 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 from dynmap_rl.cells import Cell, list_cells
-from dynmap_rl.commands import check_at_least_one, run_recipe
+from dynmap_rl.commands import check_at_least_one, replace_defaults, run_recipe
 
 RECIPES = Path(__file__).parent
+SMOKE = Path("runs/tables_smoke")
 
 
 @dataclass
 class Config:
-    # Folder of the cells' results, and of their runs.
+    # Folder of the cells' results; by default those that come with the repository.
     results: Path = RECIPES / "results"
+    # Folder of the cells' runs.
     runs: Path = Path("runs/tables")
-    # Only cells whose name holds this.
+    # Only the cell of this name, or those whose name holds it.
     only: str = ""
     # Cells at a time on this machine; each takes two cores if it is alone, otherwise one.
     workers: int = 1
     # local, or ray: the cluster that RAY_ADDRESS names, or one on this machine. Its machines share this folder.
     launcher: str = "local"
-    # CPUs and GPUs that Ray sets aside for a cell.
+    # CPUs that Ray sets aside for a cell.
     cpus: float = 2
+    # GPUs that Ray sets aside for a cell.
     gpus: float = 0
     # List the cells and stop.
     dry_run: bool = False
     # Print the tables as markdown or json, or the findings (claims of the paper, tested), and stop.
     print: str | None = None
-    # Every cell in a minimal size, for tests.
+    # Every cell in a minimal size, for tests, in runs/tables_smoke.
     smoke: bool = False
 
 
@@ -54,15 +60,25 @@ def run_cell(cell: Cell, config: Config, root: Path) -> str | None:
     command = [sys.executable, str(RECIPES / f"{cell.recipe}.py"), *cell.arguments, "--run", str(folder)]
     if cell.needs:
         command += ["--world_model", str(config.runs / cell.needs)]
-    command += ["--threads", "1"] if config.workers > 1 else []
+    cores = config.cpus if config.launcher == "ray" else 2 if config.workers == 1 else 1
+    command += ["--threads", str(max(1, int(cores)))]
     command += ["--smoke"] if config.smoke else []
     log.parent.mkdir(parents=True, exist_ok=True)
     with open(log, "a") as file:
         if subprocess.run(command, cwd=root, stdout=file, stderr=file).returncode:
             said = (log.read_text(errors="replace").splitlines() or ["nothing"])[-1]
             return f"{cell.name} failed; see {config.runs / cell.name}.log, which ends with: {said}"
-    write_json(root / config.results / f"{cell.name}.json", read_json(root / folder / "eval.json"))
+    if not is_done(cell, config, root):
+        write_json(root / config.results / f"{cell.name}.json", read_json(root / folder / "eval.json"))
     return None
+
+
+def is_done(cell: Cell, config: Config, root: Path = Path()) -> bool:
+    return (root / config.results / f"{cell.name}.json").exists()
+
+
+def has_run(name: str, config: Config) -> bool:
+    return (config.runs / name / "eval.json").exists()
 
 
 def launch_local(cells: list[Cell], config: Config) -> Iterator[tuple[Cell, str | None]]:
@@ -114,33 +130,54 @@ def launch(cells: list[Cell], config: Config) -> list[str]:
     return failed
 
 
+def choose_cells(config: Config) -> tuple[list[Cell], list[Cell], list[Cell]]:
+    """Those that ``only`` names, those of them to be run, and the world models they need whose run is not there."""
+    cells = list_cells()
+    chosen = [cell for cell in cells if cell.name == config.only]
+    chosen = chosen or [cell for cell in cells if config.only in cell.name]
+    if not chosen:
+        raise ValueError(f"no cell's name holds {config.only!r}; --dry_run lists them")
+    todo = [cell for cell in chosen if not is_done(cell, config)]
+    needed = {cell.needs for cell in todo if cell.needs and not has_run(cell.needs, config)}
+    return chosen, todo, [cell for cell in cells if cell.name in needed and cell not in todo]
+
+
+def check_config(config: Config) -> None:
+    check_at_least_one(config, "workers", "cpus")
+    if config.launcher not in LAUNCHERS:
+        raise ValueError(f"--launcher is {' or '.join(LAUNCHERS)}, not {config.launcher!r}")
+    ignored = {"local": ("cpus", "gpus"), "ray": ("workers",)}[config.launcher]
+    if given := [name for name in ignored if getattr(config, name) != getattr(Config, name)]:
+        raise ValueError(f"--{given[0]} says nothing to --launcher {config.launcher}; leave it out")
+
+
 def main(config: Config) -> None:
     if config.print:
         from dynmap_rl.evaluation.tables import print_tables
 
         return print_tables(config.results, config.print)
-    check_at_least_one(config, "workers")
-    if config.launcher not in LAUNCHERS:
-        raise ValueError(f"--launcher is {' or '.join(LAUNCHERS)}, not {config.launcher!r}")
-    cells = [cell for cell in list_cells() if config.only in cell.name]
-    if not cells:
-        raise ValueError(f"no cell's name holds {config.only!r}; --dry_run lists them")
-    todo = [cell for cell in cells if not (config.results / f"{cell.name}.json").exists()]
+    check_config(config)
+    if config.smoke:
+        replace_defaults(config, {"results": SMOKE / "results", "runs": SMOKE})
+    cells, todo, sources = choose_cells(config)
     if config.dry_run:
-        for cell in cells:
-            print(f"{f'{cell.minutes:3} min' if cell in todo else '   done'}  {cell.name}")
-        hours = sum(cell.minutes for cell in todo) / config.workers / 60
+        for cell in [*sources, *cells]:
+            print(f"{f'{cell.minutes:3} min' if cell in sources + todo else '   done'}  {cell.name}")
+        hours = sum(cell.minutes for cell in sources + todo) / 60
         return print(
-            f"{len(cells) - len(todo)} of {len(cells)} cells are done; about {hours:.1f} hours are left"
+            f"{len(cells) - len(todo)} of {len(cells)} cells are done; about {hours:.1f} hours of one core are left"
         )
-    if not config.smoke:
-        from dynmap_rl.data import record_dataset
+    if not todo:
+        return print(
+            f"nothing to do: {len(cells)} cells are in {config.results}; for a grid of your own name --results"
+        )
+    from dynmap_rl.settings import find_or_record
 
-        for task in {cell.task for cell in todo}:  # here, so that cells do not record at the same time
-            record_dataset(Path("datasets") / task, task)
-    failed = launch([cell for cell in todo if not cell.needs], config)
-    ready = [c for c in todo if c.needs and (config.runs / c.needs / "eval.json").exists()]
-    missing = [c.name for c in todo if c.needs and c not in ready]
+    for task in {cell.task for cell in sources + todo}:  # here, so that cells do not record at the same time
+        find_or_record(SimpleNamespace(task=task, dataset=None, smoke=config.smoke))
+    failed = launch([*sources, *(cell for cell in todo if not cell.needs)], config)
+    ready = [cell for cell in todo if cell.needs and has_run(cell.needs, config)]
+    missing = [cell.name for cell in todo if cell.needs and cell not in ready]
     failed += launch(ready, config) + [f"{name} waits for its world model" for name in missing]
     if failed:
         raise ValueError("; ".join(failed))

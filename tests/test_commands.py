@@ -22,7 +22,7 @@ def run(monkeypatch, main, *arguments):
     commands.run_recipe(main, Settings)
 
 
-@pytest.mark.parametrize("arguments", [["--dry-run"], ["--dry_run", "true"], ["--dry-run=true"]])
+@pytest.mark.parametrize("arguments", [["--dry-run"], ["--dry_run", "True"], ["--dry-run=true"]])
 def test_options_with_hyphens_and_bare_flags(monkeypatch, arguments):
     seen = []
     run(monkeypatch, seen.append, *arguments, "--steps=-4")
@@ -70,7 +70,8 @@ def test_the_command_is_the_same_wherever_the_repository_lies(monkeypatch):
     assert commands.command_line() == "python recipes/expert.py --task bin_dropping"
 
 
-def test_only_what_still_has_its_default_is_replaced():
+def test_only_what_was_not_asked_for_is_replaced(monkeypatch):
+    monkeypatch.setattr("sys.argv", ["recipes/some.py", "--dry-run", "false"])
     config = Settings(steps=7)
-    commands.replace_defaults(config, {"steps": 1, "rate": 0.2})
-    assert (config.steps, config.rate) == (7, 0.2)
+    commands.replace_defaults(config, {"steps": 1, "rate": 0.2, "dry_run": True})
+    assert config == Settings(steps=7, rate=0.2, dry_run=False)

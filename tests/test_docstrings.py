@@ -1,8 +1,10 @@
 """Every public name says what it is: modules, their classes and functions, and the methods that others may call."""
 
+import ast
 import importlib
 import inspect
 import pkgutil
+from pathlib import Path
 
 import pytest
 
@@ -39,3 +41,19 @@ def test_public_names_are_documented(name):
     if name.startswith("dynmap_rl.integrations"):
         pytest.importorskip("accelerate")
     assert list(undocumented(importlib.import_module(name))) == []
+
+
+@pytest.mark.parametrize(
+    "path", sorted((Path(__file__).parents[1] / "recipes").glob("*.py")), ids=lambda path: path.stem
+)
+def test_every_option_has_its_own_help(path):
+    """``--help`` shows the comment above a field, so that one comment for several is shown for the first alone."""
+    source = path.read_text()
+    [config] = [
+        node for node in ast.parse(source).body if isinstance(node, ast.ClassDef) and node.name == "Config"
+    ]
+    fields = [node for node in config.body if isinstance(node, ast.AnnAssign)]
+    before = [source.splitlines()[field.lineno - 2].strip() for field in fields]
+    assert [
+        field.target.id for field, line in zip(fields, before, strict=True) if not line.startswith("#")
+    ] == []

@@ -115,6 +115,11 @@ CASES = [
     (lambda p: truncate(p / DATA / "meta/info.json"), TRAIN, "info.json cannot be read"),
     (lambda p: truncate(p / DATA / "meta/dynmap.json"), TRAIN, "dynmap.json cannot be read"),
     (nothing, f"{TRAIN} --task bin_dropping", "is of balance_reaching, not of bin_dropping"),
+    (
+        lambda p: change_json(p / DATA / "meta/dynmap.json", kind="exploration"),
+        TRAIN,
+        "is not to be imitated",
+    ),
     (nothing, f"collect --output {DATA} --episodes 9", "another recording .episodes: 4 there"),
     (nothing, "collect --output runs", "runs exists"),
     # Runs and checkpoints.
@@ -162,6 +167,7 @@ CASES = [
     # Options.
     (nothing, f"{TRAIN} --bogus 1", "there is no option --bogus; see --help"),
     (nothing, f"{TRAIN} --world-modell {RUN}", r"no option --world_modell; do you mean --world_model\?"),
+    (nothing, f"{TRAIN} --copies -1", "--copies must not be negative"),
     (nothing, f"{TRAIN} --updates many", "Couldn.t parse .many. into an int|updates.*int"),
     (nothing, f"{TRAIN} --supervision speed", "unknown supervision"),
     (nothing, f"{TRAIN} --task juggling", "unknown task"),
@@ -179,6 +185,12 @@ CASES = [
     (nothing, f"{TRAIN} --threads 0", "--threads must be at least 1"),
     (nothing, "expert --epochs 0", "--epochs must be at least 1"),
     (nothing, "tables --dry_run --workers 0", "--workers must be at least 1"),
+    (
+        lambda p: change_json(p / RUN / "config.json", task="none"),
+        EVALUATE,
+        "there is no simulator; its eval.json has",
+    ),
+    (nothing, "tables --gpus 1", "--gpus says nothing to --launcher local"),
     (lambda p: change_json(p / RUN / "config.json", task="this:s"), EVALUATE, "do so with --task this:s"),
     (
         lambda p: change_json(p / RUN / "config.json", task="os:abort"),

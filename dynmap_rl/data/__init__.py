@@ -3,6 +3,7 @@
 import importlib
 
 _MODULES = {
+    "META": "loading",
     "NO_TASK": "foreign",
     "add_distractors": "augmentation",
     "as_replay_buffer": "replay",

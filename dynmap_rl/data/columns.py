@@ -22,7 +22,13 @@ from .writing import quiet
 
 
 def write_columns(
-    root: Path, output: Path, info: dict, table: pa.Table, values: dict[str, np.ndarray], names: list[str]
+    root: Path,
+    output: Path,
+    info: dict,
+    table: pa.Table,
+    values: dict[str, np.ndarray],
+    names: list[str],
+    without: tuple[str, ...] = (),
 ) -> None:
     """Copy the dataset to a new folder, which appears when it is whole, with columns that it gets or that it replaces.
 
@@ -31,6 +37,7 @@ def write_columns(
         table: ``index`` and ``episode_index`` of all frames, in order.
         values: the columns, float32 ``[N, D]``.
         names: of their entries.
+        without: files that are left out.
 
     Raises:
         OSError: the folder cannot be written.
@@ -40,7 +47,8 @@ def write_columns(
         shutil.rmtree(temporary, ignore_errors=True)
         for file in sorted(path for path in root.rglob("*") if path.is_file()):
             relative = file.relative_to(root)
-            if relative.parts[0].startswith("."):  # the hub's notes on a download
+            # Beginning with a dot: the hub's notes on a download.
+            if relative.parts[0].startswith(".") or str(relative) in without:
                 continue
             target = temporary / relative
             target.parent.mkdir(parents=True, exist_ok=True)

@@ -12,6 +12,7 @@ from dynmap_rl.modules import DYNAMICS
 
 from .columns import write_columns
 from .frames import choose_camera, iterate_frames
+from .loading import META
 from .reading import find_dataset, read_column, read_info, read_table, spans
 from .tracking import WIDEST, track_centroid
 
@@ -120,9 +121,10 @@ def add_dynamics(
             raise ValueError(f"{root}: episode {episode} {error}") from error
         for quantity, part in zip(DYNAMICS, parts, strict=True):
             values[quantity][rows] = part
-    write_columns(
-        root, output, info, table, {f"dynamics.{q}": v.astype(np.float32) for q, v in values.items()}, names
-    )
+    # A recording's constants and scenes say nothing of dynamics that are no longer those of cart and block.
+    without = () if [len(names)] == [info["features"][name]["shape"][0] for name in old[:1]] else (META,)
+    new = {f"dynamics.{q}": v.astype(np.float32) for q, v in values.items()}
+    write_columns(root, output, info, table, new, names, without)
     there = {q: read(f"dynamics.{q}") for q in DYNAMICS if f"dynamics.{q}" in old}
     return {q: np.abs(values[q] - v).mean(0) for q, v in there.items() if v.shape == values[q].shape}
 

@@ -109,7 +109,10 @@ def _decode_video(
 
     episode = episodes[rows["episode_index"][0].as_py()]
     chunk, number = (episode[f"videos/{camera}/{key}"] for key in ("chunk_index", "file_index"))
-    path = root / info["video_path"].format(video_key=camera, chunk_index=chunk, file_index=number)
+    path = Path(info["video_path"].format(video_key=camera, chunk_index=chunk, file_index=number))
+    if path.is_absolute() or ".." in path.parts:
+        raise ValueError(f"{root} names a video outside of itself, {path}; restore the dataset")
+    path = root / path
     times = episode[f"videos/{camera}/from_timestamp"] + rows["timestamp"].to_numpy().astype(np.float64)
     for start in range(0, len(times), BLOCK):
         some = times[start : start + BLOCK].tolist()

@@ -8,11 +8,12 @@ from pathlib import Path
 
 from tensordict import TensorDict
 
+from dynmap_rl.envs.scene import SEEDS_PER_SPLIT, scene_seed
 from dynmap_rl.runs import lock_folder, read_json, write_json
 
 from .demonstrations import Plan
 from .loading import META, load_meta
-from .recording import FORMAT, Shard, merge_shards, write_shard
+from .recording import FORMAT, ROWS, Shard, merge_shards, write_shard
 
 KIND = "human"
 
@@ -94,6 +95,13 @@ def list_shards(root: str | Path, task: str) -> list[Shard]:
     """The kept episodes, each a dataset of its own."""
     folders = sorted(path for path in _parts(root).glob("[0-9]*") if path.suffix != ".tmp")
     return [Shard(folder, task, KIND, KIND, "train", number, 1) for number, folder in enumerate(folders)]
+
+
+def next_scene(root: str | Path, task: str) -> int:
+    """The number of the first scene of the split ``train`` after all that episodes were kept of."""
+    rows = [row for shard in list_shards(root, task) for row in read_json(shard.folder / ROWS)]
+    numbers = [row["scene_seed"] - scene_seed("train", 0) for row in rows]
+    return 1 + max((n for n in numbers if 0 <= n < SEEDS_PER_SPLIT), default=-1)
 
 
 def _parts(root: str | Path) -> Path:

@@ -24,6 +24,7 @@ NEEDED = {
     "action": "action",
     **{("dynamics", name): f"dynamics.{name}" for name in ("position", "velocity", "acceleration")},
 }
+SIZES = {"observation.state": 5, "action": 3} | {name: 6 for name in NEEDED.values() if "dynamics" in name}
 OPTIONAL = {("next", name): f"next.{name}" for name in ("reward", "done", "success")}
 
 
@@ -92,6 +93,11 @@ def _choose_columns(root: Path, info: dict) -> dict:
         raise ValueError(f"{root} stores {CAMERA} as {dtype}; record it as images (use_videos=False)")
     if (shape := tuple(features[CAMERA]["shape"])) != FRAME_SHAPE:
         raise ValueError(f"{root} has frames of {shape}, not {FRAME_SHAPE} (height, width, RGB); resize them")
+    for name, size in SIZES.items():
+        if (shape := tuple(features[name]["shape"])) != (size,):
+            raise ValueError(
+                f"{root} has {name} of {shape}, not ({size},): it is of no task of ours; use --task none"
+            )
     return NEEDED | {key: name for key, name in OPTIONAL.items() if name in features}
 
 

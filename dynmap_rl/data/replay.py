@@ -13,8 +13,8 @@ def as_replay_buffer(
     """Episodes ``[E, T]`` as a buffer whose ``sample()`` is ``batch`` random windows ``[batch, length]``.
 
     Each window lies in one episode; episodes, and the places in them, are equally likely. The buffer holds the
-    episodes themselves, not a copy; samples are copies, with two entries more: ``episode`` and ``index`` ``[batch,
-    length]``. ``append_transform`` takes any transform of windows, :class:`dynmap_rl.envs.WorldModelTransform` too.
+    episodes themselves, not a copy; samples are copies, with two entries more: ``trajectory`` (the
+    number of the episode) and ``index`` ``[batch, length]``. ``append_transform`` takes any transform of windows, :class:`dynmap_rl.envs.WorldModelTransform` too.
 
     Args:
         episodes: what :func:`dynmap_rl.data.load_dataset` gave.
@@ -28,8 +28,8 @@ def as_replay_buffer(
     if steps < length:
         raise ValueError(f"windows of {length} steps do not fit into episodes of {steps}")
     number = torch.arange(count, device=episodes.device)[:, None].expand(count, steps)
-    flat = episodes.copy().set("episode", number).reshape(-1)
-    sampler = _WindowSampler(slice_len=length, traj_key="episode", truncated_key=None, cache_values=True)
+    flat = episodes.copy().set("trajectory", number).reshape(-1)
+    sampler = _WindowSampler(slice_len=length, traj_key="trajectory", truncated_key=None, cache_values=True)
     return TensorDictReplayBuffer(
         storage=TensorStorage(flat), sampler=sampler, batch_size=batch, generator=generator
     )

@@ -11,7 +11,6 @@ from torchrl.envs import ModelBasedEnvBase
 
 from dynmap_rl.modules import MEMORY, WorldModel
 
-from .gymnasium_env import ACTION_LIMITS
 from .transforms import WorldModelTransform
 
 STEP_KEYS = ("latent", "predicted_latent", *MEMORY)
@@ -87,10 +86,11 @@ class ImaginationEnv(ModelBasedEnvBase):
             if key in (*STEP_KEYS, *self.constant):
                 state[key] = observation[key].clone()
         self.observation_spec, self.state_spec = observation, state
-        limit = torch.as_tensor(ACTION_LIMITS["position"], dtype=torch.float32, device=device).expand(
-            *shape, 3
+        action = self.world_model.transition.action
+        low, high = (
+            x.expand(*shape, -1).clone() for x in (action.center - action.scale, action.center + action.scale)
         )
-        self.action_spec = Bounded(-limit, limit, limit.shape, dtype=torch.float32, device=device)
+        self.action_spec = Bounded(low, high, low.shape, dtype=torch.float32, device=device)
         self.reward_spec = Unbounded((*shape, 1), dtype=torch.float32, device=device)
 
     def _reset(

@@ -84,7 +84,7 @@ def markdown_findings(results: Path) -> str:
                 lines.append(f"| {row['comparison']} | {rates} | {gap} | {p} |")
         parts.append("\n".join(lines))
     if seeded := spread(results):
-        lines = ["| three world models each | SR of each | mean (std) |", "|---|---|---|"]
+        lines = ["| world models of several seeds | SR of each | mean (std) |", "|---|---|---|"]
         for row in seeded:
             rates = ", ".join(f"{rate:.1f}" for rate in row["SR"])
             lines.append(f"| {row['row']} | {rates} | {row['mean']:.1f} ({row['std']:.1f}) |")

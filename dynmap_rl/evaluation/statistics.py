@@ -66,13 +66,16 @@ def success_gap(rows_a: list[list[dict]], rows_b: list[list[dict]]) -> dict:
     a, b = count(rows_a, len(rows_b)), count(rows_b, len(rows_a))
     difference = 100 * (a - b) / (len(rows_a) * len(rows_b))
     gap = float(difference.mean())
-    if np.ptp(difference) == 0:
-        return {"gap": gap, "interval": (gap, gap), "p": 1.0 if gap == 0 else 0.0}
-    interval = bootstrap((difference,), np.mean, rng=np.random.default_rng(0)).confidence_interval
+    interval = gap, gap  # where there is nothing to choose from
+    if np.ptp(difference):
+        found = bootstrap((difference,), np.mean, rng=np.random.default_rng(0)).confidence_interval
+        interval = float(found.low), float(found.high)
+    if len(difference) < 2 or not difference.any():  # one start state can go either way
+        return {"gap": gap, "interval": interval, "p": 1.0}
     test = permutation_test(
         (a, b), _difference, permutation_type="samples", batch=500, rng=np.random.default_rng(0)
     )
-    return {"gap": gap, "interval": (float(interval.low), float(interval.high)), "p": float(test.pvalue)}
+    return {"gap": gap, "interval": interval, "p": float(test.pvalue)}
 
 
 def _difference(a: np.ndarray, b: np.ndarray, axis: int) -> np.ndarray:

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor
 
-from dynmap_rl.envs.tasks import BalanceReaching
+from dynmap_rl.envs.tasks import BalanceReaching, get_task
 from dynmap_rl.envs.world import EPISODE_STEPS, World
 from dynmap_rl.runs import read_json
 from dynmap_rl.weights import load_module
@@ -81,7 +81,8 @@ def list_checkpoints(expert: str | Path) -> list[str]:
     Raises:
         ValueError: there is none.
     """
-    names = sorted(path.stem for path in find_expert(expert).glob("*.safetensors"))
+    names = [path.stem for path in find_expert(expert).glob("*.safetensors")]
+    names.sort(key=lambda name: (len(name), name))  # iteration_1000 after iteration_995
     if not names:
         raise ValueError(
             f"no expert at {expert}; train one with recipes/expert.py and name its checkpoint folder"
@@ -103,6 +104,19 @@ def load_expert(expert: str | Path, checkpoint: str | None = None) -> ExpertNetw
         return ExpertNetwork(facts["state_size"], tuple(facts["acceleration_limit"]), facts["hidden"])
 
     return load_module(folder / f"{checkpoint}.safetensors", make).eval().requires_grad_(False)
+
+
+def task_of_expert(expert: str | Path, task: BalanceReaching) -> BalanceReaching:
+    """The task whose ``state`` an expert sees (see :func:`list_checkpoints`), which it can play ``task`` by.
+
+    Raises:
+        ValueError: ``task`` has no such states.
+    """
+    facts = read_json(find_expert(expert) / f"{list_checkpoints(expert)[-1]}.json")
+    sees = get_task(facts["task"], from_file=True)
+    if not issubclass(task.ranges.scene, sees.ranges.scene):
+        raise ValueError(f"the expert {expert} sees states of {sees.name}, which {task.name} does not have")
+    return sees
 
 
 def find_expert(expert: str | Path) -> Path:

@@ -161,5 +161,6 @@ def rates(task: BalanceReaching, worlds: Iterable[World]) -> dict[str, float]:
 
 
 def fresh_scenes(count: int) -> list[int]:
-    """Seeds of scenes for choosing a checkpoint: of the exploration split, never evaluated or trained on."""
+    """Seeds of the scenes that checkpoints are judged on, the last by more of them: of the exploration split, never trained
+    on, and none of the tables' test scenes."""
     return [scene_seed("exploration", 10_000_000 + i) for i in range(count)]

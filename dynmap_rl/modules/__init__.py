@@ -10,6 +10,7 @@ from .checkpoints import (
     make_world_model,
     save_policy,
     save_world_model,
+    task_of_run,
 )
 from .decoder import DYNAMICS, DynamicsDecoder, ImageDecoder
 from .encoder import Encoder, SpatialSoftmax
@@ -49,4 +50,5 @@ __all__ = [
     "mixed_precision",
     "save_policy",
     "save_world_model",
+    "task_of_run",
 ]

@@ -138,6 +138,21 @@ def find_run(run: str | Path) -> Path:
         raise ValueError(f"no policy at {run}, neither as a folder nor on the hub ({reason})") from error
 
 
+def task_of_run(run: Path) -> str | None:
+    """The task that a run folder was trained on; None where it does not say.
+
+    Raises:
+        ValueError: it was trained on a dataset of no task of ours, and there is no simulator for it.
+    """
+    settings = read_json(run / "config.json") if (run / "config.json").exists() else {}
+    if (task := settings.get("task")) == "none":
+        raise ValueError(
+            f"{run} was trained on {settings.get('dataset')}, for which there is no simulator; its eval.json has its "
+            "errors on held-out episodes"
+        )
+    return task
+
+
 def _read_arguments(folder: Path) -> dict:
     path = Path(folder) / "arguments.json"
     if not path.exists():

@@ -16,7 +16,6 @@ class FeedforwardPolicy(nn.Module):
         latent_size, hidden_size: Z and H of the world model.
         action, goal: normalisers; their sizes are A and G.
         width: of the hidden layers.
-        dropout: on the input features, during training.
     """
 
     def __init__(
@@ -26,11 +25,9 @@ class FeedforwardPolicy(nn.Module):
         action: Normalizer,
         goal: Normalizer,
         width: int = 256,
-        dropout: float = 0.0,
     ):
         super().__init__()
         self.action, self.goal, self.width = action, goal, width
-        self.dropout = nn.Dropout(dropout)
         self.layers = nn.Sequential(
             nn.Linear(latent_size + 2 * hidden_size + goal.size, width),
             nn.SiLU(),
@@ -41,8 +38,8 @@ class FeedforwardPolicy(nn.Module):
 
     def forward(self, latent, hidden1, hidden2, goal) -> torch.Tensor:
         """``[..., Z]``, ``[..., H]`` twice and the goal ``[..., G]`` (SI units) to the action ``[..., A]`` (SI)."""
-        features = self.dropout(torch.cat([latent, hidden1, hidden2], -1))
-        return self.action.denormalize(self.layers(torch.cat([features, self.goal.normalize(goal)], -1)))
+        features = torch.cat([latent, hidden1, hidden2, self.goal.normalize(goal)], -1)
+        return self.action.denormalize(self.layers(features))
 
     def step(self, latent, hidden1, hidden2, goal, state: State | None = None):
         """The same for one time step; the state passes through, so that both policies are called alike."""
@@ -60,7 +57,6 @@ class RecurrentPolicy(nn.Module):
         latent_size, hidden_size: Z and H of the world model.
         action, goal: normalisers; their sizes are A and G.
         width: hidden size of the policy's own cells.
-        dropout: on the input features, during training.
     """
 
     def __init__(
@@ -70,11 +66,9 @@ class RecurrentPolicy(nn.Module):
         action: Normalizer,
         goal: Normalizer,
         width: int = 128,
-        dropout: float = 0.0,
     ):
         super().__init__()
         self.action, self.goal, self.width = action, goal, width
-        self.dropout = nn.Dropout(dropout)
         self.embed = nn.Sequential(nn.Linear(latent_size + 2 * hidden_size + goal.size, width), nn.SiLU())
         self.lstm = TwoLSTM(width, width)
         self.head = nn.Sequential(nn.Linear(2 * width, width), nn.SiLU(), nn.Linear(width, action.size))
@@ -96,8 +90,7 @@ class RecurrentPolicy(nn.Module):
         return self.lstm.initial_state(batch, device)
 
     def _embed(self, latent, hidden1, hidden2, goal) -> torch.Tensor:
-        features = self.dropout(torch.cat([latent, hidden1, hidden2], -1))
-        return self.embed(torch.cat([features, self.goal.normalize(goal)], -1))
+        return self.embed(torch.cat([latent, hidden1, hidden2, self.goal.normalize(goal)], -1))
 
     def _act(self, x: torch.Tensor, top: torch.Tensor) -> torch.Tensor:
         return self.action.denormalize(self.head(torch.cat([x, top], -1)))

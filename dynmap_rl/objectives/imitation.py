@@ -34,9 +34,9 @@ def imitation_loss(
     if emphasis:
         before = F.pad(action[:, :-1], (0, 0, 1, 0))
         weight = weight + emphasis * ((action - before) / normalizer.scale).abs().mean(-1, keepdim=True)
-    if ignore is not None:
-        weight = weight * ~ignore
-    return (error * weight).sum() / weight.sum()
+    if ignore is not None:  # by choice, not by a product: what is ignored may be NaN
+        error, weight = (torch.where(ignore, 0.0, x) for x in (error, weight))
+    return (error * weight).sum() / weight.sum().clamp_min(1)
 
 
 def find_ignored(

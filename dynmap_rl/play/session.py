@@ -11,11 +11,10 @@ from tensordict import TensorDict
 
 from dynmap_rl.data.demonstrations import KEYS
 from dynmap_rl.envs import DynmapBatchedEnv, scene_seed
-from dynmap_rl.envs.tasks import BalanceReaching, get_task
+from dynmap_rl.envs.tasks import BalanceReaching
 from dynmap_rl.envs.world import ACTION_LIMIT, CONTROL_DT, EPISODE_STEPS
-from dynmap_rl.experts import find_expert, list_checkpoints, load_expert
+from dynmap_rl.experts import load_expert, task_of_expert
 from dynmap_rl.modules import DYNAMICS, Actor
-from dynmap_rl.runs import read_json
 
 DRIVERS = "hand", "expert", "policy"
 HAND_ACCELERATION = np.array([1.5, 1.5, 4.0])  # m/s^2, m/s^2, rad/s^2: at the cart's limit a tall block tips
@@ -182,8 +181,4 @@ def _find_expert(task: BalanceReaching, name: str | Path, named: bool):
         if named:
             raise
         return None, None
-    facts = read_json(find_expert(name) / f"{list_checkpoints(name)[-1]}.json")
-    sees = get_task(facts["task"], from_file=True)
-    if not issubclass(task.ranges.scene, sees.ranges.scene):
-        raise ValueError(f"the expert {name} sees states of {sees.name}, which {task.name} does not have")
-    return expert, sees
+    return expert, task_of_expert(name, task)

@@ -137,6 +137,17 @@ def test_what_is_not_there_is_named(folders, arguments, message):
         load_foreign(folders / "plain", 20, **arguments)
 
 
+def test_a_video_outside_of_the_dataset_is_not_opened(folders, tmp_path):
+    import json
+    import shutil
+
+    root = shutil.copytree(folders / "plain_videos", tmp_path / "copy")
+    info = json.loads((root / "meta/info.json").read_text())
+    (root / "meta/info.json").write_text(json.dumps(info | {"video_path": "../" + info["video_path"]}))
+    with pytest.raises(ValueError, match="names a video outside of itself"):
+        load_foreign(root, 20)
+
+
 def test_a_damaged_video_is_named(folders, tmp_path):
     import shutil
 

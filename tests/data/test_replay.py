@@ -29,7 +29,7 @@ def test_samples_are_windows_of_one_episode_each(episodes):
     assert sample.shape == (200, 3)
     number = sample["number"].squeeze(-1)
     assert (number.diff(dim=1) == 1).all()
-    assert (number // 8 == sample["episode"]).all()
+    assert (number // 8 == sample["trajectory"]).all()
     assert set(number[:, 0].tolist()) == {8 * e + t for e in range(5) for t in range(6)}, "every place"
     assert torch.equal(sample["next", "done"], number.unsqueeze(-1) % 8 >= 5), "flags are as they were"
 

@@ -10,7 +10,15 @@ from torchrl.envs.utils import check_env_specs
 from dynmap_rl.data import load_dataset
 from dynmap_rl.envs import ImaginationEnv, make_start
 from dynmap_rl.evaluation import open_loop_errors
-from dynmap_rl.modules import MEMORY, LatentActor, make_policy, make_policy_module, make_world_model
+from dynmap_rl.modules import (
+    MEMORY,
+    LatentActor,
+    Normalizer,
+    WorldModel,
+    make_policy,
+    make_policy_module,
+    make_world_model,
+)
 
 CONSTANTS = {
     "action": {"low": [-0.02, -0.02, -0.05], "high": [0.02, 0.02, 0.05]},
@@ -60,6 +68,18 @@ def test_specs(frames, arguments):
     assert (("reconstruction", "pixels") in env.rollout(1).keys(True)) is ("decode_pixels" in arguments)
     bare = TensorDict({"latent": torch.zeros(B, 16)}, [B])
     check_env_specs(ImaginationEnv(make_model(()), bare, arguments.get("decode_pixels", False)))
+
+
+def test_actions_are_those_of_the_world_model():
+    action = Normalizer([-1.0, 0.0], [1.0, 0.5])
+    model = WorldModel(action, {}, latent_size=16, hidden_size=24)
+    env = ImaginationEnv(model, TensorDict({"latent": torch.zeros(B, 16)}, [B]))
+    check_env_specs(env)
+    assert env.action_spec.shape == (B, 2)
+    assert env.action_spec.space.low[0].tolist() == [-1, 0] and env.action_spec.space.high[0].tolist() == [
+        1,
+        0.5,
+    ]
 
 
 @torch.no_grad()
@@ -139,6 +159,7 @@ class Perfect(torch.nn.Module):
     def __init__(self, position: torch.Tensor):
         super().__init__()
         self.position, self.transition = position, torch.nn.Module()
+        self.transition.action = Normalizer([-0.02] * 3, [0.02] * 3)
         self.constant = torch.nn.Parameter(torch.zeros(1))
 
     def encode(self, pixels, mixed=False):

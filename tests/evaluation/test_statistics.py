@@ -44,6 +44,13 @@ def test_p_is_that_of_a_sign_test_where_each_start_state_has_one_outcome():
     assert success_gap([b], [a])["p"] == pytest.approx(14 / 64)
 
 
+@pytest.mark.parametrize(("count", "p"), [(1, 1.0), (3, 0.25), (6, 1 / 32)])
+def test_p_where_all_start_states_agree(count, p):
+    """a always succeeds, b never: 2 / 2**count by hand."""
+    result = success_gap([rows(count, count=count)], [rows(0, count=count)])
+    assert result == {"gap": 100.0, "interval": (100.0, 100.0), "p": pytest.approx(p)}
+
+
 def test_p_does_not_depend_on_rounding():
     """One of three policies fails in three starts of 1,000, where the others always succeed: 2 / 2**3 by hand."""
     a = [rows(1000, count=1000), rows(1000, count=1000), rows(997, count=1000)]

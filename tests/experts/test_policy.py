@@ -13,7 +13,14 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from dynmap_rl.envs import DynmapBatchedEnv, scene_seed
 from dynmap_rl.envs.tasks import TASKS, get_task
 from dynmap_rl.envs.world import ACCELERATION_LIMIT
-from dynmap_rl.experts import ExpertNetwork, list_checkpoints, load_expert, make_actor, roll_out
+from dynmap_rl.experts import (
+    ExpertNetwork,
+    list_checkpoints,
+    load_expert,
+    make_actor,
+    roll_out,
+    task_of_expert,
+)
 from dynmap_rl.experts.policy import CHECKPOINTS
 from dynmap_rl.runs import read_json
 
@@ -96,6 +103,18 @@ def test_an_expert_is_also_named_by_its_folder(tmp_path, as_text):
     assert torch.equal(mean, load_expert("bin_dropping", first)(state)[0])
     with pytest.raises(ValueError, match=f"no checkpoint '{second}'.*mine"):
         load_expert(folder, second)
+
+
+def test_checkpoints_are_in_the_order_of_their_iterations(tmp_path):
+    for iteration in (995, 1000, 50):
+        (tmp_path / f"iteration_{iteration:03d}.safetensors").touch()
+    assert list_checkpoints(tmp_path) == ["iteration_050", "iteration_995", "iteration_1000"]
+
+
+def test_an_expert_that_sees_what_a_task_does_not_have_is_refused():
+    assert task_of_expert("balance_reaching", get_task("bin_dropping")).name == "balance_reaching"
+    with pytest.raises(ValueError, match="sees states of bin_dropping, which balance_reaching does not have"):
+        task_of_expert("bin_dropping", get_task("balance_reaching"))
 
 
 def test_unknown_expert_or_checkpoint_raises(tmp_path):

@@ -135,9 +135,9 @@ def test_windows_are_those_of_our_own_loader(recording):
         expected = episodes[episode][list(steps)]
         for key in ("pixels", "action", "goal", "dynamics"):
             assert (windows[row][key] == expected[key]).all(), key
-        pushed = expected["disturbed"].clone()
-        pushed[3:] |= row == 2
-        assert torch.equal(windows["disturbed"][row], pushed)
+        assert torch.equal(windows["disturbed"][row], expected["disturbed"])
+        there = [row != 2 or step < 3 for step in range(6)]
+        assert windows["collector", "mask"][row].tolist() == there
 
 
 @pytest.mark.parametrize(

@@ -114,6 +114,17 @@ def test_ignored_steps_do_not_count_however_much_they_are_emphasised():
     assert imitation_loss(action + error, action, normalizer, ignore, emphasis=4.0) == 0
 
 
+@pytest.mark.parametrize("ignore", [[True, False], [True, True]])
+def test_what_is_ignored_may_be_anything(ignore):
+    """NaN in an ignored step, and no step that counts: a number, and gradients that are."""
+    action = torch.tensor([[[torch.nan], [0.5]]])
+    predicted = torch.zeros(1, 2, 1, requires_grad=True)
+    mask = torch.tensor(ignore).view(1, 2, 1)
+    loss = imitation_loss(predicted, action, Normalizer([-1.0], [1.0]), mask)
+    loss.backward()
+    assert loss == (0.0 if all(ignore) else 0.5) and predicted.grad.isfinite().all()
+
+
 def test_rms_has_a_gradient_at_zero():
     x = torch.zeros(3, requires_grad=True)
     rms(x).backward()

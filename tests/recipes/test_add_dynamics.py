@@ -152,6 +152,14 @@ def test_what_it_says_of_our_own_recordings_is_near_the_simulators_truth(recordi
     assert torch.equal(truth["pixels"], derived["pixels"])
 
 
+def test_dynamics_of_another_size_are_of_no_task_of_ours(recording, tmp_path):
+    main(Config(dataset=str(recording), output=tmp_path / "tracked", track=True, replace=True))
+    with pytest.raises(ValueError, match=r"dynamics.position of \(2,\), not \(6,\): .* --task none"):
+        load_dataset(tmp_path / "tracked")
+    result = run(tmp_path, "decoupled", "--smoke", "--dataset", tmp_path / "tracked")
+    assert result.returncode == 2 and "train on this one with --task none" in result.stderr
+
+
 def test_positions_from_the_picture(pair, tmp_path):
     main(Config(dataset=str(pair[0]), output=tmp_path / "tracked", track=True))
     position, state = read(tmp_path / "tracked", "dynamics.position"), read(pair[0], "observation.state")
@@ -193,6 +201,8 @@ def test_a_killed_run_leaves_nothing_that_looks_done(images, tmp_path):
         ),
         ({"dataset": "no/where/here"}, "no dataset at no/where/here"),
         ({"dataset": None}, "name the dataset"),
+        ({"track": True, "columns": "0"}, "--columns says nothing with --track"),
+        ({"camera": "observation.images.top"}, "--camera says nothing without --track"),
     ],
 )
 def test_bad_input_is_refused_before_anything_is_written(images, tmp_path, settings, message):

@@ -1,13 +1,16 @@
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from commands import run
+from safetensors.torch import load_file, save_file
 
 from dynmap_rl.envs.tasks import TASKS
+from dynmap_rl.settings import find_or_record
 from recipes.decoupled import Config, main
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "decoupled.py"
@@ -96,6 +99,7 @@ def test_bad_input_is_refused_before_anything_is_written(tmp_path, settings, mes
         ),
         ("world_model", {"task": "bin_dropping"}, "is a world model of balance_reaching, .* use recipes/gen"),
         ("seed_0/policy", {}, "holds no finished run"),
+        ("", {"updates": 5}, "--updates is of a world model's training, and that of --world_model is done"),
     ],
 )
 def test_a_world_model_of_another_row_is_refused(smoke, tmp_path, path, settings, message):
@@ -104,6 +108,33 @@ def test_a_world_model_of_another_row_is_refused(smoke, tmp_path, path, settings
     with pytest.raises(ValueError, match=message):
         main(Config(smoke=True, world_model=trained, run=tmp_path / "bad", **settings))
     assert not (tmp_path / "bad").exists()
+
+
+def test_a_world_model_that_is_no_longer_the_same_is_noticed(smoke, tmp_path):
+    folder, _ = smoke
+    source = tmp_path / "source"
+    shutil.copytree(folder / "runs/decoupled/balance_reaching/position_velocity_recurrent_smoke", source)
+    data = str(folder / "datasets/balance_reaching_smoke")
+    main(config := Config(smoke=True, world_model=source, run=tmp_path / "run", dataset=data))
+    weights = source / "world_model/weights.safetensors"
+    save_file({name: value + 1 for name, value in load_file(weights).items()}, weights)
+    with pytest.raises(ValueError, match="was made with another world model"):
+        main(config)
+
+
+def test_the_dataset_that_is_there_is_taken(recording, tmp_path, monkeypatch):
+    """Of any number of episodes, but of demonstrations of the task."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(recording, "datasets/balance_reaching")
+    assert find_or_record(Config()) == Path("datasets/balance_reaching")
+    for changes, message in (
+        ({"kind": "exploration"}, "is of exploration"),
+        ({"task": "bin_dropping"}, "is of bin"),
+    ):
+        path = Path("datasets/balance_reaching/meta/dynmap.json")
+        path.write_text(json.dumps(json.loads((recording / "meta/dynmap.json").read_text()) | changes))
+        with pytest.raises(ValueError, match=message):
+            find_or_record(Config())
 
 
 @pytest.mark.parametrize("task", sorted({*TASKS} - {"balance_reaching"}))

@@ -8,6 +8,7 @@ from commands import run
 from PIL import Image
 
 from dynmap_rl.data import keep_episode, load_dataset, load_meta, publish_episodes
+from dynmap_rl.data.human import next_scene
 from dynmap_rl.envs import scene_seed
 from dynmap_rl.envs.renderer import pygame
 from dynmap_rl.modules import make_policy, make_world_model, save_policy, save_world_model
@@ -95,10 +96,13 @@ def test_what_a_person_drove_becomes_a_dataset(tmp_path, monkeypatch):
     assert (meta["kind"], meta["splits"]) == ("human", {"train": [0, 1], "eval": [1, 2]})
     assert all(row["success"] for row in meta["episodes"])
 
-    played = Session("balance_reaching", seed=7)
+    played = Session("balance_reaching", seed=7, split="train")
     for _ in range(120):
         played.step()
     assert keep_episode(tmp_path / "mine", "balance_reaching", played.episode(), played.scene_seed) == 3
+    assert next_scene(tmp_path / "mine", "balance_reaching") == 8, (
+        "after those that were kept, and failed, before"
+    )
     publish_episodes(tmp_path / "mine", "balance_reaching")
     assert load_dataset(tmp_path / "mine", "train").shape == (2, 120)
     assert not (tmp_path / "mine.parts/old.tmp").exists()

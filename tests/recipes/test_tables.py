@@ -4,6 +4,7 @@ import importlib
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -61,6 +62,14 @@ def test_cells_run_once_and_are_printed_beside_the_paper(recordings, tmp_path):
     assert again.stdout == "done: bin_dropping_joint_none_recurrent\n"
     assert all(path.stat().st_mtime_ns == time for path, time in times.items() if "bin" not in path.name)
 
+    assert run(tmp_path, *smoke).stdout.startswith("nothing to do: 3 cells are in results")
+
+    shutil.rmtree(tmp_path / "runs")  # as in a fresh clone, where results are but no runs
+    (tmp_path / "results/bin_dropping_joint_none_recurrent.json").unlink()
+    fresh = run(tmp_path, "--smoke", "--only", "bin_dropping_joint_none_recurrent")
+    assert fresh.stdout.splitlines() == [f"done: {names[0]}", f"done: {names[2]}"], fresh.stderr
+    assert all(path.stat().st_mtime_ns == time for path, time in times.items() if "bin" not in path.name)
+
     rows = json.loads(run(tmp_path, "--print", "json").stdout)
     assert [(r["table"], r["row"], r["column"], r["n"]) for r in rows] == [
         (table, "Only-RGB", "joint, recurrent", 3) for table in ("I", "II", "III")
@@ -78,8 +87,8 @@ def test_ray_runs_the_same_cells(recordings, tmp_path, monkeypatch):
     commands.place_recordings(tmp_path, recordings, *TASKS[:2])
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-    (tmp_path / "runs/tables/bin_dropping_joint_none_recurrent").mkdir(parents=True)
-    (tmp_path / "runs/tables/bin_dropping_joint_none_recurrent/config.json").write_text("{}")
+    (tmp_path / "runs/tables_smoke/bin_dropping_joint_none_recurrent").mkdir(parents=True)
+    (tmp_path / "runs/tables_smoke/bin_dropping_joint_none_recurrent/config.json").write_text("{}")
     command = [sys.executable, str(RECIPE), "--results", "results", "--smoke", "--only", "joint_none"]
     command += ["--launcher", "ray", "--cpus", "1"]
     result = subprocess.run(command, cwd=tmp_path, env=os.environ, capture_output=True, text=True)
@@ -87,15 +96,15 @@ def test_ray_runs_the_same_cells(recordings, tmp_path, monkeypatch):
     assert [line.removeprefix("done: ") for line in result.stdout.splitlines()] == names, result.stderr
     assert sorted(p.stem for p in (tmp_path / "results").iterdir()) == sorted(names)
     assert result.returncode == 2
-    assert "bin_dropping_joint_none_recurrent failed; see runs/tables/" in result.stderr
+    assert "bin_dropping_joint_none_recurrent failed; see runs/tables_smoke/" in result.stderr
 
 
 def test_a_cell_that_fails_says_where_to_look_and_the_others_go_on(tmp_path):
-    (tmp_path / "runs/tables/balance_reaching_joint_none_recurrent").mkdir(parents=True)
-    (tmp_path / "runs/tables/balance_reaching_joint_none_recurrent/config.json").write_text("{}")
+    (tmp_path / "runs/tables_smoke/balance_reaching_joint_none_recurrent").mkdir(parents=True)
+    (tmp_path / "runs/tables_smoke/balance_reaching_joint_none_recurrent/config.json").write_text("{}")
     result = run(tmp_path, "--smoke", "--only", "joint_none")
     assert result.returncode == 2
-    assert "balance_reaching_joint_none_recurrent failed; see runs/tables/" in result.stderr
+    assert "balance_reaching_joint_none_recurrent failed; see runs/tables_smoke/" in result.stderr
     assert "bin_dropping_joint_none_recurrent waits for its world model" in result.stderr
     assert "joint_none_recurrent.log, which ends with: error: " in result.stderr
     assert "holds a run with other settings" in result.stderr

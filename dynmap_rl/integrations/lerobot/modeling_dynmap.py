@@ -82,7 +82,7 @@ class DynmapPolicy(PreTrainedPolicy):
 
     def make_windows(self, batch: dict[str, torch.Tensor]) -> TensorDict:
         """A batch of LeRobot's as our losses want it: ``[B, T]`` with ``pixels``, ``action``, ``goal``, ``dynamics``
-        and ``disturbed``, which is also true beyond the end of an episode.
+        ``disturbed``, and the mask that is false beyond the end of an episode, which the losses leave out.
 
         Raises:
             ValueError: the policy was made without a dataset.
@@ -100,7 +100,8 @@ class DynmapPolicy(PreTrainedPolicy):
             "action": action,
             "goal": batch[OBS_STATE][..., -2:],
             "dynamics": {name: getattr(self, name)[rows] for name in DYNAMICS},
-            "disturbed": self.disturbed[rows] | beyond.unsqueeze(-1),
+            "disturbed": self.disturbed[rows],
+            ("collector", "mask"): ~beyond,
         }
         return TensorDict(data, action.shape[:2], device=action.device)
 
