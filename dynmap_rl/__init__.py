@@ -18,6 +18,10 @@ def __getattr__(name: str):
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
+def __dir__() -> list[str]:
+    return [*__all__, "GYMNASIUM_IDS", "__version__"]
+
+
 GYMNASIUM_IDS = {
     "dynmap_rl/BalanceReaching-v0": "balance_reaching",
     "dynmap_rl/BalanceReachingObstacle-v0": "balance_reaching_obstacle",

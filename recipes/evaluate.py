@@ -36,6 +36,8 @@ class Config:
     episodes: int = 1000
     # Split that they are of: test, or validation while you choose settings.
     split: str = "test"
+    # cpu, cuda, or auto: the GPU where there is one. For policies of ours.
+    device: str = "auto"
     # JSON file; by default one in runs/evaluate.
     output: Path | None = None
 
@@ -59,6 +61,7 @@ def judge_policy(config: Config) -> tuple[str, dict]:
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.evaluation import evaluate
     from dynmap_rl.modules import find_run, load_actor, task_of_run
+    from dynmap_rl.runs import choose_device
 
     folder = find_run(config.policy)
     task = config.task or task_of_run(folder) or "balance_reaching"
@@ -66,7 +69,7 @@ def judge_policy(config: Config) -> tuple[str, dict]:
     if not folder.exists():
         raise ValueError(f"there is no policy at {config.policy}; train one with recipes/decoupled.py")
     if (folder / "world_model").exists() or any(folder.glob("seed_*")):
-        actor = load_actor(folder, config.seed)
+        actor = load_actor(folder, config.seed).to(choose_device(config.device))
     elif not Path(config.policy).expanduser().exists() and not config.trust_remote_code:
         raise ValueError(
             f"{config.policy} is a policy of LeRobot on the hub, whose files may name code to run; if you trust whoever "

@@ -9,7 +9,7 @@ on the same folder resumes. To ship checkpoints with the package, copy them to `
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynmap_rl.commands import check_at_least_one, run_recipe
+from dynmap_rl.commands import check_at_least_one, command_line, run_recipe
 
 
 @dataclass
@@ -58,7 +58,15 @@ def main(config: Config) -> None:
     from dynmap_rl.envs.world import ACCELERATION_LIMIT
     from dynmap_rl.evaluation import write_html
     from dynmap_rl.experts import ExpertNetwork, list_checkpoints, roll_out
-    from dynmap_rl.experts.ppo import POSITIVE, fresh_scenes, rates, train_ppo
+    from dynmap_rl.experts.ppo import (
+        POSITIVE,
+        failures_first,
+        film,
+        fresh_scenes,
+        rates,
+        rates_text,
+        train_ppo,
+    )
     from dynmap_rl.loggers import check_logger
 
     check_logger(config.logger)
@@ -84,9 +92,12 @@ def main(config: Config) -> None:
     }
     train_ppo(env, network, folder, config, judge, facts)
     last = runs.read_json(folder / "checkpoint" / f"{list_checkpoints(folder / 'checkpoint')[-1]}.json")
-    row = f"success {last['success']:.1%}   drop {last['drop']:.1%}   ({last['episodes']} scenes)"
-    write_html(folder, f"Expert, {env.task.name}", row)
-    print(f"done: {folder}")
+    seeds = fresh_scenes(config.eval_episodes)
+    some = failures_first(env.task, roll_out(network, env.task, seeds), seeds)
+    scenes = DynmapBatchedEnv(config.task, len(some), from_pixels=True, control="acceleration")
+    film(scenes, network, some, folder / "rollouts.gif")
+    write_html(folder, f"Expert, {env.task.name}", rates_text(last), command_line())
+    print(f"{rates_text(last)}\ndone: {folder}")
 
 
 if __name__ == "__main__":

@@ -74,7 +74,7 @@ def main(config: Config) -> None:
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.envs.world import ACCELERATION_LIMIT
     from dynmap_rl.evaluation import write_html
-    from dynmap_rl.experts.ppo import POSITIVE, fresh_scenes, rates, train_ppo
+    from dynmap_rl.experts.ppo import POSITIVE, failures_first, film, fresh_scenes, rates, train_ppo
     from dynmap_rl.loggers import check_logger
     from dynmap_rl.training import fingerprint
 
@@ -122,13 +122,17 @@ def main(config: Config) -> None:
         "states": states | {"expert": config.expert or config.task},
         "command": command_line(),
     }
+    seeds = fresh_scenes(config.eval_episodes)
+    some = failures_first(task, roll_out(network, world_model, config.task, seeds), seeds)
+    scenes = make_env(world_model, config.task, len(some), keep_pixels=True)
+    film(scenes, network, some, folder / "rollouts.gif")
     write_html(folder, f"PPO on latents, {task.name}", result_text(result), result["command"])
     runs.write_json(folder / "eval.json", result)
     print(result_text(result))
 
 
-def make_env(world_model, task: str, num_envs: int):
-    """``state`` is what the world model makes of the frames, and the goal; frames themselves are not kept."""
+def make_env(world_model, task: str, num_envs: int, keep_pixels: bool = False):
+    """``state`` is what the world model makes of the frames, and the goal; frames themselves are kept if asked for."""
     from torchrl.envs import CatTensors, Compose, ExcludeTransform, TransformedEnv
 
     from dynmap_rl.envs import DynmapBatchedEnv, WorldModelTransform
@@ -136,7 +140,8 @@ def make_env(world_model, task: str, num_envs: int):
     env = DynmapBatchedEnv(task, num_envs, from_pixels=True, control="acceleration", pixels_only=True)
     states = CatTensors(["latent", "hidden1", "hidden2", "goal"], "state", del_keys=False, sort=False)
     transform = WorldModelTransform(world_model, agent_pos="agent_pos", mixed=True)
-    return TransformedEnv(env, Compose(transform, states, ExcludeTransform("pixels")))
+    rest = [] if keep_pixels else [ExcludeTransform("pixels")]
+    return TransformedEnv(env, Compose(transform, states, *rest))
 
 
 def roll_out(network, world_model, task: str, seeds: list[int]) -> list:
@@ -154,11 +159,9 @@ def roll_out(network, world_model, task: str, seeds: list[int]) -> list:
 
 
 def result_text(result: dict) -> str:
-    return "\n".join(
-        f"PPO on {name:8} success {row['success']:6.1%}   drop {row['drop']:6.1%}   "
-        f"position error {1000 * row['position_error']:.0f} mm   ({row['episodes']} scenes)"
-        for name, row in ((name, result[name]) for name in ("latents", "states"))
-    )
+    from dynmap_rl.experts.ppo import rates_text
+
+    return "\n".join(f"PPO on {name:8} {rates_text(result[name])}" for name in ("latents", "states"))
 
 
 if __name__ == "__main__":

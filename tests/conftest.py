@@ -1,7 +1,9 @@
 """No network, no display, one thread; and one small recording a task that the tests share."""
 
+import contextlib
 import functools
 import os
+import zipfile
 from pathlib import Path
 
 os.environ["HF_HUB_OFFLINE"] = "1"
@@ -12,10 +14,24 @@ import pytest
 import torch
 
 torch.set_num_threads(1)
+ROOT = Path(__file__).parents[1]
 
 
 def pytest_configure(config):
     config.addinivalue_line("markers", "slow: starts processes of its own; leave out with -m 'not slow'")
+
+
+@pytest.fixture(scope="session")
+def installed(tmp_path_factory):
+    """The folder of the package and of LeRobot's plugin as their wheels hold them: to be named in ``PYTHONPATH``."""
+    build_wheel = pytest.importorskip("hatchling.build").build_wheel
+    wheels, site = tmp_path_factory.mktemp("wheels"), tmp_path_factory.mktemp("site")
+    for project in (ROOT, ROOT / "dynmap_rl/integrations/lerobot_policy_dynmap"):
+        with contextlib.chdir(project):
+            name = build_wheel(str(wheels))
+        with zipfile.ZipFile(wheels / name) as wheel:
+            wheel.extractall(site)
+    return site
 
 
 @pytest.fixture(scope="session")

@@ -3,8 +3,9 @@
     uv run python tests/kills.py              # 20 kills of each of collect, expert, decoupled, tables
     uv run python tests/kills.py expert -n 5
 
-Every process of the recipe gets SIGKILL. What must be the same: every number of a dataset and its metadata, every
-weight, every metric but the wall-clock time, every row of every cell. Ends with an error where anything differs.
+Every process of the recipe gets SIGKILL. What must be the same in the end: every number of a dataset and its metadata,
+every weight, every metric but the wall-clock time, every row of every cell. And nothing that was finished may be made
+again: shards of a dataset, policies, cells, saved updates. Ends with an error where anything differs.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import tempfile
 import time
 from pathlib import Path
 
+import torch
 from safetensors.torch import load_file
 
 RECIPES = Path(__file__).parents[1] / "recipes"
@@ -71,6 +73,31 @@ def contents(folder: Path) -> dict[str, object]:
     return found
 
 
+def finished(folder: Path) -> dict[str, int]:
+    """What a later run must leave as it is, with the time when it was made, and how far every training was saved."""
+    found = {}
+    for path in sorted(folder.rglob("*")):
+        name = str(path.relative_to(folder))
+        if ".tmp" in name:
+            continue
+        if path.suffix == ".pt":
+            state = torch.load(path, weights_only=True)
+            found[name] = state["update"] if "update" in state else state["iteration"]
+        elif path.name == "eval.json" or path.parent.name == "results" or path.name == "episodes.json":
+            found[name] = path.stat().st_mtime_ns
+    return found
+
+
+def lost(before: dict[str, int], folder: Path) -> list[str]:
+    """What has been made again, or is gone; but for the shards of a dataset that is whole by now."""
+    now = finished(folder)
+    whole = {str(path.relative_to(folder).parents[1]) for path in folder.rglob("meta/dynmap.json")}
+    names = [name for name in before if not any(name.startswith(f"{root}.parts/") for root in whole)]
+    return [
+        n for n in names if n not in now or (now[n] < before[n] if n.endswith(".pt") else now[n] != before[n])
+    ]
+
+
 def plain(value):
     if isinstance(value, dict):
         return {key: plain(item) for key, item in value.items() if key not in LEFT_OUT}
@@ -87,8 +114,13 @@ def torment(recipe: str, kills: int, folder: Path) -> None:
     while count < kills:
         killed, runs = folder / f"{recipe}_killed_{runs}", runs + 1
         killed.mkdir()
-        while not run(recipe, killed, random.uniform(0, duration) if count < kills else None):
-            count += 1
+        kept, ended = {}, False
+        while not ended:
+            ended = run(recipe, killed, random.uniform(0, duration) if count < kills else None)
+            count += not ended
+            if again := lost(kept, killed):
+                raise SystemExit(f"{recipe}: after {count} kills these were made again: {', '.join(again)}")
+            kept = finished(killed)
         found = contents(killed)
         differing = sorted(name for name in {*expected, *found} if expected.get(name) != found.get(name))
         if differing:

@@ -3,8 +3,14 @@
 import importlib
 import json
 import re
+import shlex
 from pathlib import Path
 
+import draccus
+import pytest
+
+from dynmap_rl.commands import read_arguments
+from dynmap_rl.evaluation import wilson
 from dynmap_rl.evaluation.findings import markdown_findings
 from dynmap_rl.evaluation.tables import COLUMNS, markdown_overview, markdown_table, read_cells
 
@@ -66,27 +72,24 @@ def test_claims_are_those_of_the_results():
         assert f"[{rate:.1f} %]({file}) in task {task}" in text
 
 
-def test_every_option_and_file_that_the_readme_names_exists():
+def test_every_file_that_the_readme_names_exists():
     for path in re.findall(r"(?:recipes|dynmap_rl|tests)/[\w/]+\.(?:py|json|png|gif)", README):
         assert (ROOT / path).exists(), path
-    options = set(re.findall(r"--(\w+)", " ".join(re.findall(r"recipes/\w+\.py.*", README))))
-    known = "".join(
-        (ROOT / "recipes" / f"{name}.py").read_text()
-        for name in (
-            "decoupled",
-            "joint",
-            "generalize",
-            "collect",
-            "expert",
-            "evaluate",
-            "tables",
-            "add_dynamics",
-            "play",
-            "probe",
-        )
-    )
-    for option in options:
-        assert re.search(rf"^    {option}: ", known, re.M), option
+
+
+def commands():
+    """The recipes in the README's commands, and their arguments."""
+    lines = "".join(re.findall(r"```bash\n(.*?)```", README, re.S)).replace("\\\n", " ").splitlines()
+    for line in lines:
+        if found := re.search(r"recipes/(\w+)\.py(.*)", line):
+            yield found[1], shlex.split(found[2], comments=True)
+
+
+@pytest.mark.parametrize(("recipe", "arguments"), commands(), ids=lambda part: str(part))
+def test_the_commands_are_understood(recipe, arguments):
+    config_class = importlib.import_module(f"recipes.{recipe}").Config
+    config = draccus.parse(config_class, args=read_arguments(arguments, config_class), exit_on_error=False)
+    assert config != config_class() or not arguments
 
 
 def test_rates_of_the_experts_are_those_of_the_results():
@@ -219,3 +222,19 @@ def test_the_baseline_is_that_of_the_results():
     summary = json.loads((ROOT / "recipes/results/act_balance_reaching.json").read_text())["summary"]
     low, high = summary["SR_interval"]
     assert f"[SR {summary['SR']:.1f} % [{low:.1f}, {high:.1f}], PE {summary['PE']:.1f} mm]" in README
+    theirs = json.loads((ROOT / "recipes/results/act_lerobot_eval.json").read_text())
+    count, rate = theirs["n_episodes"], theirs["pc_success"]
+    least, most = wilson(round(count * rate / 100), count)
+    assert f"[{rate:.1f} % [{least:.1f}, {most:.1f}] of {count}]" in README
+    assert least <= high and low <= most, "by our protocol and by LeRobot's"
+
+
+def test_the_validators_are_those_of_the_results():
+    found = json.loads((ROOT / "recipes/results/validators.json").read_text()).values()
+    text = " ".join(README.split())
+    assert all(result["exit"] == 0 for task in found for result in task.values())
+    assert all("0 fail · 0 warn · 1 info · 29 pass" in task["robovet"]["said"] for task in found)
+    assert all("Summary: 8 PASS | 3 WARN" in task["lerobot-doctor"]["said"] for task in found)
+    scores = [re.search(r"Score (\d+)/100", " ".join(task["rdq"]["said"]))[1] for task in found]
+    assert "robovet passes 29 of 29 checks, lerobot-doctor 8 with 3 warnings" in text
+    assert f"rdq gives {scores[0]}, {scores[1]} and {scores[2]} of 100" in text

@@ -77,9 +77,11 @@ def test_a_resumed_world_model_equals_an_uninterrupted_one(tmp_path, monkeypatch
         train_world_model(make_model(), episodes, tmp_path / "parts", SETTINGS, save_every=2)
     runs.append_metrics(tmp_path / "parts", 5, loss_rgb=0.0)  # written after the last state, then killed
     monkeypatch.undo()
-    resumed = make_model()
+    resumed, updates = make_model(), []
+    monkeypatch.setattr(training, "sample_windows", lambda *args: updates.append(1) or sample_windows(*args))
     train_world_model(resumed, episodes, tmp_path / "parts", SETTINGS, save_every=2)
 
+    assert len(updates) == SETTINGS.updates - 4, "what was saved is not trained again"
     assert fingerprint(resumed) == fingerprint(whole)
     assert runs.read_metrics(tmp_path / "parts") == runs.read_metrics(tmp_path / "whole")
 

@@ -6,7 +6,7 @@ from .imagination import open_loop_errors
 from .paper import TABLES, paper_numbers, parse_supervision, row_name
 from .report import SHARED_STARTS, evaluate, print_row, write_report
 from .rollout import episode_rows, roll_out, scene_seeds
-from .statistics import success_gap, summarize, summarize_seeds, wilson
+from .statistics import shared_interval, success_gap, summarize, summarize_seeds, wilson
 
 __all__ = [
     "SHARED_STARTS",
@@ -21,6 +21,7 @@ __all__ = [
     "roll_out",
     "row_name",
     "scene_seeds",
+    "shared_interval",
     "success_gap",
     "summarize",
     "summarize_seeds",

@@ -51,6 +51,8 @@ def write_held_out(
     mean absolute error of every entry of the supervised dynamics, one step ahead, and of the action: means over the
     seeds. ``spread`` has that of the best constant, which knows the held-out pieces but no frame.
     """
+    from .figures import plot_reconstruction
+
     errors = {k: float(np.mean([r["held_out"][k] for r in results])) for k in results[0]["held_out"]}
     if frozen:  # one world model for all seeds, which have not judged it
         world_model.cpu()  # as the episodes are
@@ -79,6 +81,8 @@ def write_held_out(
         "command": command_line(),
         "results": results,
     }
+    path = folder / "figures" / "reconstruction.png"
+    plot_reconstruction(world_model.cpu(), episodes[:3], path)
     title = f"{result['row']}, {settings.policy} policy, {dataset}"
     write_html(folder, title, held_out_text(result), result["command"])
     write_json(folder / "eval.json", result)  # last: it says that all is done

@@ -19,7 +19,7 @@ from .held_out import held_out_text, write_held_out
 from .html import write_html
 from .paper import METRICS, paper_numbers, row_name
 from .rollout import episode_rows, roll_out, scene_seeds
-from .statistics import summarize, summarize_seeds
+from .statistics import shared_interval, summarize, summarize_seeds
 
 UNITS = {"DR": "%", "PE": "mm", "SR": "%"}
 SHARED_STARTS = 1000  # the paper's protocol uses the scenes after these
@@ -94,7 +94,9 @@ def write_report(
         "seeds": list(seeds),
         "world_model_sha256": frozen,
         "paper_protocol": summarize_seeds([_rows(r["paper"]["rows"]) for r in results]),
-        "test_protocol": summarize([row for rows in test for row in rows]) | _localization(results),
+        "test_protocol": summarize([row for rows in test for row in rows])
+        | {"SR_interval": shared_interval(test), "DR_interval": shared_interval(test, "dropped")}
+        | _localization(results),
         "settings": {
             k: str(v) if isinstance(v, Path) else v for k, v in dataclasses.asdict(settings).items()
         },
@@ -136,7 +138,7 @@ def row_text(result: dict) -> str:
     if result["task"] == NO_TASK:
         return held_out_text(result)
     ours, test, paper = result["paper_protocol"], result["test_protocol"], paper_numbers(result)
-    low, high = test["SR_interval"]
+    low, high = shared_interval(result_rows(result))
     values = "   ".join(f"{name} {test[name]:.1f} {UNITS[name]}" for name in _metrics(result))
     lines = [
         _title(result),
@@ -150,7 +152,7 @@ def row_text(result: dict) -> str:
 def markdown_row(result: dict) -> str:
     """A row of the README's tables: the paper's numbers, ours by its protocol, ours on the shared start states."""
     test, paper = result["test_protocol"], paper_numbers(result)
-    low, high = test["SR_interval"]
+    low, high = shared_interval(result_rows(result))
     others = [f"{test[name]:.1f}" for name in _metrics(result) if name != "SR"]
     ours = _short({name: result["paper_protocol"][name] for name in _metrics(result)})
     rate = f"**{test['SR']:.1f}** [{low:.1f}, {high:.1f}]"

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import binomtest, bootstrap, permutation_test
+from scipy.stats import bootstrap, norm, permutation_test
 
 
 def summarize(rows: list[dict]) -> dict[str, float]:
-    """DR and SR in %, PE in mm (paper, Sec. V-B), over any number of episode rows, with 95 % Wilson intervals; and
-    the share of episodes in which a wall was touched, in % (``touched``)."""
+    """DR and SR in %, PE in mm (paper, Sec. V-B), over any number of episode rows, with 95 % Wilson intervals as of
+    independent episodes; and the share of episodes in which a wall was touched, in % (``touched``)."""
     count = len(rows)
     dropped = sum(row["dropped"] for row in rows)
     success = sum(row["success"] for row in rows)
@@ -37,10 +37,27 @@ def summarize_seeds(rows_by_seed: list[list[dict]]) -> dict[str, tuple[float, fl
     }
 
 
-def wilson(successes: int, count: int) -> tuple[float, float]:
+def wilson(successes: float, count: float) -> tuple[float, float]:
     """95 % Wilson interval of a rate, in %."""
-    interval = binomtest(successes, count).proportion_ci(0.95, method="wilson")
-    return float(100 * interval.low), float(100 * interval.high)
+    rate, z = successes / count, float(norm.ppf(0.975))
+    middle = rate + z**2 / (2 * count)
+    half = z * (rate * (1 - rate) / count + z**2 / (4 * count**2)) ** 0.5
+    low, high = (100 * (middle + sign * half) / (1 + z**2 / count) for sign in (-1, 1))
+    return max(low, 0.0), min(high, 100.0)
+
+
+def shared_interval(rows_by_seed: list[list[dict]], outcome: str = "success") -> tuple[float, float]:
+    """95 % interval of a rate over policy seeds that met the same start states, in %.
+
+    Their episodes are not independent: a start state that is hard for one is hard for the others. Wilson's interval is
+    taken for as many independent episodes as would vary as much as the means over the seeds do from start state to
+    start state (Kish's effective sample size): at least one a start state, at most all.
+    """
+    values = np.array([[row[outcome] for row in rows] for rows in rows_by_seed], float)  # [seeds, starts]
+    rate, starts = values.mean(), values.shape[1]
+    spread = values.mean(0).var(ddof=1) / starts if starts > 1 else 0.0
+    count = np.clip(rate * (1 - rate) / spread, starts, values.size) if spread else starts
+    return wilson(float(rate * count), float(count))
 
 
 def success_gap(rows_a: list[list[dict]], rows_b: list[list[dict]]) -> dict:

@@ -8,7 +8,8 @@ from pathlib import Path
 from dynmap_rl.runs import read_json
 
 from .paper import METRICS, TABLES, paper_numbers
-from .report import markdown_row
+from .report import markdown_row, result_rows
+from .statistics import shared_interval
 
 COLUMNS = {  # table: its columns, as (task, training, policy)
     "I": [key for key in TABLES if key[0] == "balance_reaching"],
@@ -52,7 +53,7 @@ def table_rows(results: Path) -> list[dict]:
                             "column": ", ".join(column[1:]),
                             **{name: test[name] for name in ("DR", "PE", "SR")},
                             "n": test["episodes"],
-                            "interval": test["SR_interval"],
+                            "interval": shared_interval(result_rows(result)),
                             "protocol": result["paper_protocol"],
                             "paper": paper_numbers(result),
                             "seeds": result["seeds"],

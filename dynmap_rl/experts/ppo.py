@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 from torchrl.modules import MLP, ValueOperator
@@ -19,6 +19,8 @@ from dynmap_rl import runs
 from dynmap_rl.envs import scene_seed
 from dynmap_rl.envs.tasks import BalanceReaching
 from dynmap_rl.envs.world import EPISODE_STEPS, World
+from dynmap_rl.evaluation import wilson
+from dynmap_rl.evaluation.figures import save_gif
 from dynmap_rl.loggers import log_metrics
 from dynmap_rl.training import check_loss
 from dynmap_rl.weights import save_weights
@@ -158,6 +160,37 @@ def rates(task: BalanceReaching, worlds: Iterable[World]) -> dict[str, float]:
         "position_error": sum(world.position_error for world in worlds) / len(worlds),
         "episodes": len(worlds),
     }
+
+
+def rates_text(row: dict) -> str:
+    """What :func:`rates` gave as text, with the 95 % Wilson interval of the success rate."""
+    low, high = wilson(row["success"] * row["episodes"], row["episodes"])
+    error = f"position error {1000 * row['position_error']:.0f} mm"
+    rate = f"success {100 * row['success']:.1f} % [{low:.1f}, {high:.1f}]   drop {100 * row['drop']:.1f} %"
+    return f"{rate}   {error}   ({row['episodes']} scenes)"
+
+
+@torch.no_grad()
+def film(env: EnvBase, network: ExpertNetwork, seeds: list[int], path: Path) -> None:
+    """An animation of the mean action's episodes, one a scene seed.
+
+    Args:
+        env: ``[len(seeds)]`` worlds with ``state`` and ``pixels``.
+        path: of the GIF.
+    """
+    td, frames = env.reset(scene_seed=torch.tensor(seeds)), []
+    for _ in range(EPISODE_STEPS):
+        frames.append(td["pixels"])
+        td = env.step(td.set("action", network(td["state"])[0]))["next"]
+    save_gif(TensorDict({"pixels": torch.stack(frames, 1)}, [len(seeds), EPISODE_STEPS]), path)
+
+
+def failures_first(
+    task: BalanceReaching, worlds: Iterable[World], seeds: list[int], count: int = 8
+) -> list[int]:
+    """``count`` of the scene seeds, those first whose worlds ended without success."""
+    success = [task.is_success(world) for world in worlds]
+    return [seed for _, seed in sorted(zip(success, seeds, strict=True))][:count]
 
 
 def fresh_scenes(count: int) -> list[int]:

@@ -1,6 +1,15 @@
+import numpy as np
 import pytest
 
-from dynmap_rl.evaluation import parse_supervision, row_name, success_gap, summarize, summarize_seeds, wilson
+from dynmap_rl.evaluation import (
+    parse_supervision,
+    row_name,
+    shared_interval,
+    success_gap,
+    summarize,
+    summarize_seeds,
+    wilson,
+)
 
 
 def rows(successes, dropped=0, count=10, error=0.02):
@@ -20,6 +29,26 @@ def test_wilson_interval_is_the_textbook_one():
     assert wilson(46, 50) == pytest.approx((81.2, 96.8), abs=0.1)  # 92 % of 50
     low, high = wilson(0, 10)
     assert low == pytest.approx(0.0, abs=1e-9) and 25 < high < 31
+
+
+def test_seeds_that_agree_say_no_more_than_one():
+    one = rows(70, count=100)
+    assert shared_interval([one] * 3) == pytest.approx(wilson(70, 100))
+    assert shared_interval([rows(100, count=100)] * 3) == pytest.approx(wilson(100, 100))
+
+
+def test_shared_interval_holds_the_rate_as_often_as_it_says():
+    """Start states are easy or hard for all three policies. One that takes all episodes for independent is too narrow."""
+    rng, held, held_by_wilson = np.random.default_rng(0), [], []
+    for _ in range(400):
+        hard = rng.random(100) < 0.4
+        success = rng.random((3, 100)) < np.where(hard, 0.1, 0.9)  # 58 %
+        low, high = shared_interval([[{"success": s} for s in seed] for seed in success])
+        held.append(low <= 58 <= high)
+        low, high = wilson(int(success.sum()), 300)
+        held_by_wilson.append(low <= 58 <= high)
+    assert 0.92 < np.mean(held) < 0.98
+    assert np.mean(held_by_wilson) < 0.85
 
 
 def test_paper_s_protocol_is_mean_and_standard_deviation_over_seeds():

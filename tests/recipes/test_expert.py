@@ -52,6 +52,12 @@ def test_run_folder_is_complete(finished):
         assert facts["iteration"] == iteration and facts["episodes"] == 4
     first, last = (load_file(finished / "checkpoint" / f"iteration_00{i}.safetensors") for i in (1, 2))
     assert any(not torch.equal(first[k], last[k]) for k in first)
+    page = (finished / "report.html").read_text()
+    assert (
+        "[" in page
+        and "Rollouts in closed loop, failures first" in page
+        and "success 0.0 % [0.0, 49.0]" in page
+    )
 
 
 @pytest.mark.parametrize("moment", ["before the state is saved", "after the state is saved"])

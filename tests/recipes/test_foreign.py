@@ -47,6 +47,7 @@ def test_smoke_run_holds_held_out_errors(dataset, tmp_path, recipe, arguments, g
     latent, hidden1, hidden2 = torch.zeros(1, 2, 64), *torch.zeros(2, 1, 2, 128)
     assert policy(latent, hidden1, hidden2, torch.zeros(1, 2, goal)).shape == (1, 2, 2)
     assert world_model.decode_dynamics(latent, hidden1, hidden2)["position"].shape == (1, 2, 3)
+    assert "what the world model predicted from the frame before" in (folder / "report.html").read_text()
     again = run(tmp_path, recipe, *arguments)
     assert "is done" in again.stdout and result.stdout.split("\n")[1] in again.stdout
 

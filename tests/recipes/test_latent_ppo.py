@@ -58,6 +58,7 @@ def test_smoke_run_reports_both(finished, world_model, capsys):
     printed = capsys.readouterr().out
     assert "is done" in printed and "PPO on latents" in printed and "PPO on states" in printed
     assert (finished / WEIGHTS).read_bytes() == before
+    assert "Rollouts in closed loop, failures first" in (finished / "report.html").read_text()
 
 
 def test_killed_run_resumes_to_the_same_weights(finished, world_model, tmp_path, monkeypatch):

@@ -1,0 +1,48 @@
+"""The package as it is installed, away from its source: what it ships is there, and the recipes run on it."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+RECIPES = Path(__file__).parents[1] / "recipes"
+CODE = """
+import dynmap_rl
+from dynmap_rl.envs.tasks import TASKS
+from dynmap_rl.experts import list_checkpoints
+from dynmap_rl.modules import load_actor
+print(dynmap_rl.__file__, load_actor("balance_reaching").policy.width, [len(list_checkpoints(task)) for task in TASKS])
+"""
+
+
+@pytest.fixture
+def python(installed, tmp_path):
+    """Run Python on the installed package in an empty folder."""
+
+    def run(*arguments):
+        environment = os.environ | {"PYTHONPATH": str(installed), "TQDM_DISABLE": "1"}
+        command = [sys.executable, *map(str, arguments)]
+        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    return run
+
+
+def test_weights_and_experts_are_in_the_wheel(python, installed):
+    file, *others = python("-c", CODE).split()
+    assert Path(file).is_relative_to(installed)
+    assert others == ["128", "[5,", "5,", "5]"]
+
+
+def test_recipes_run_on_it(python, recording, tmp_path):
+    shutil.copytree(RECIPES, tmp_path / "mine", ignore=shutil.ignore_patterns("results", "__pycache__"))
+    assert "SR 100.0 %" in python("mine/evaluate.py", "--policy", "balance_reaching", "--episodes", 2)
+    python("mine/collect.py", "--episodes", 1, "--eval_episodes", 1, "--workers", 1, "--output", "mine/data")
+    state = "--state", "dynamics.position", "--angles", "2,5", "--replace"
+    assert "done: derived" in python(
+        "mine/add_dynamics.py", "--dataset", "mine/data", *state, "--output", "derived"
+    )
