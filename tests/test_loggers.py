@@ -1,7 +1,8 @@
 """Metrics as lines of JSON, and where else a user wants them."""
 
+import importlib
 import sys
-from types import SimpleNamespace
+from unittest import mock
 
 import pytest
 import torch
@@ -38,26 +39,27 @@ def test_tensorboard_gets_the_same_numbers(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["wandb", "trackio"])
-def test_others_are_torchrls_with_the_run_s_name(tmp_path, monkeypatch, name):
-    calls = []
-    logger = SimpleNamespace(log_scalar=lambda *scalar, step: calls.append((*scalar, step)))
-    opened = []
-    monkeypatch.setattr("torchrl.record.loggers.get_logger", lambda *a, **k: opened.append((a, k)) or logger)
+def test_others_get_them_by_torchrls_loggers_with_the_runs_name(tmp_path, monkeypatch, name):
+    """TorchRL's own logger, on a stand-in for the package that it imports."""
+    package = mock.MagicMock()
+    monkeypatch.setitem(sys.modules, name, package)
+    monkeypatch.setattr(importlib.import_module(f"torchrl.record.loggers.{name}"), f"_has_{name}", True)
     log_metrics(tmp_path, 1, name, loss=0.5)
     log_metrics(tmp_path, 2, name, loss=0.25)
-    place = str(tmp_path), tmp_path.as_posix()
-    assert [place_given for place_given, _ in opened] == [(name, *place)]
-    options = opened[0][1][f"{name}_kwargs"]
-    assert options.pop("project") == "dynmap_rl"
-    if name == "wandb":
-        assert options.pop("reinit") == "create_new"
+    [opened] = package.init.call_args_list
+    assert (opened.kwargs["project"], opened.kwargs["name"]) == ("dynmap_rl", tmp_path.as_posix())
+    logged = [(call.args[0]["loss"], call.kwargs.get("step")) for call in package.init().log.call_args_list]
+    assert [value for value, _ in logged] == [0.5, 0.25]
+    if name == "trackio":
+        assert [step for _, step in logged] == [1, 2]
+    else:
+        assert opened.kwargs["reinit"] == "create_new"
+        package.init.reset_mock()
         loggers._open.cache_clear()
         log_metrics(tmp_path, 3, name, loss=0.5)  # a process that goes on
         log_metrics(tmp_path / "other", 3, name, loss=0.5)
-        ids = [call[f"{name}_kwargs"]["id"] for _, call in opened]
-        assert options.pop("id") == ids[1] != ids[2]
-    assert options == {}
-    assert calls[:2] == [("loss", 0.5, 1), ("loss", 0.25, 2)]
+        ids = [call.kwargs["id"] for call in package.init.call_args_list if "id" in call.kwargs]
+        assert [ids[0] == opened.kwargs["id"], ids[1] == ids[0]] == [True, False]
 
 
 def test_what_is_unknown_or_not_installed_is_one_line_before_anything_is_written(tmp_path, monkeypatch):

@@ -3,12 +3,13 @@
     uv run python tests/benchmarks/memory.py
 
 Data, batches, models and evaluations are those of a full run; there are only fewer optimiser steps, which need the same
-memory again and again. Shared pages count once (proportional set size, so Linux only). Writes
+memory again and again. The cells of ``tables`` are runs of these. Shared pages count once (proportional set size, so Linux only). Writes
 ``recipes/results/memory.json``.
 """
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import tempfile
@@ -28,12 +29,20 @@ COMMANDS = {  # in this order: later ones take the world model of earlier ones
     "joint": ["--run", "joint", *FEW],
     "end_to_end": ["--run", "end_to_end", *FEW],
     "evaluate": [],
+    "latent_ppo": ["--world_model", "decoupled", "--run", "latent_ppo", "--iterations", "3"],
+    "probe": ["--runs", "decoupled"],
+    "add_dynamics": ["--dataset", "datasets/balance_reaching", "--track", "--replace", "--output", "tracked"],
+    "figures": ["--only", "fig2,fig4"],
+    "play": ["--policy", "balance_reaching", "--steps", "240", "--gif", "film.gif"],
 }
 
 
 def peak(command: list[str], folder: str) -> float:
     """GB that a command and its children held at most."""
-    process = subprocess.Popen(command, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    environment = {"SDL_VIDEODRIVER": "dummy"} | os.environ  # a window needs no screen
+    process = subprocess.Popen(
+        command, cwd=folder, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
     most = 0
     while process.poll() is None:
         most = max(most, sum(map(held, family(process.pid))))

@@ -11,7 +11,9 @@ from __future__ import annotations
 
 import os
 import platform
+import subprocess
 import sys
+from datetime import date
 from pathlib import Path
 
 os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")  # as recipes do; before torch is there
@@ -71,6 +73,12 @@ def markdown(results: dict) -> str:
     return "\n".join(lines)
 
 
+def commit() -> str:
+    return subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True
+    ).stdout.strip()
+
+
 def main(names: list[str]) -> None:
     if unknown := set(names) - set(ROWS):
         sys.exit(f"unknown rows {sorted(unknown)}; choose from {list(ROWS)}")
@@ -78,7 +86,7 @@ def main(names: list[str]) -> None:
     for name in names or ROWS:
         print(name, flush=True)
         if row := ROWS[name][-1]():
-            results["rows"][name] = row
+            results["rows"][name] = row | {"date": f"{date.today()}", "commit": commit()}
             results["machine"] = platform.platform()
             write_json(RESULTS, results)
     print(markdown(results))

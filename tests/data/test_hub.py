@@ -46,6 +46,8 @@ for note in ("first", "second"):
 from lerobot.datasets import LeRobotDataset
 
 assert len(LeRobotDataset(name, video_backend="pyav")) == 6 * 120
+part = LeRobotDataset(name, episodes=[1], video_backend="pyav")
+assert len(part) == 120 and (part[7]["dynamics.position"] == load_dataset({root!r})[1, 7]["dynamics", "position"]).all()
 """
 OFFLINE = """
 from dynmap_rl.data import load_dataset, load_meta
@@ -94,6 +96,7 @@ def test_push_a_pull_that_is_cut_off_pull_push_again_and_use_offline(recording, 
     root = str(shutil.copytree(recording, tmp_path / "dataset"))
     run(ONLINE.format(root=root), hub, tmp_path / "home")
     run(OFFLINE.format(root=root), hub, tmp_path / "home", offline="1")
+    run(OFFLINE.format(root=root), "http://127.0.0.1:9", tmp_path / "home")  # no network, and nobody said so
 
     address = f"{hub}/datasets/someone/demonstrations/resolve/v3.0"
     card = urllib.request.urlopen(f"{address}/README.md").read().decode()

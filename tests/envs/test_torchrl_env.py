@@ -96,10 +96,10 @@ def same_observation(td: TensorDict, observation: dict, env: gym.Env) -> None:
 
 @every_task
 def test_number_of_worlds_does_not_matter(task):
-    actions = random_actions(8, 30)
-    together = play(DynmapBatchedEnv(task, num_envs=8, from_pixels=True), range(8), actions)
+    actions = random_actions(64, 12)
+    together = play(DynmapBatchedEnv(task, num_envs=64, from_pixels=True), range(64), actions)
     alone = DynmapBatchedEnv(task, num_envs=1, from_pixels=True)
-    for i in range(8):
+    for i in range(64):
         assert (play(alone, [i], actions[i : i + 1])[0] == together[i]).all()
 
 
@@ -181,13 +181,15 @@ def test_worlds_in_processes_of_their_own_are_the_same_worlds():
         out = env.rollout(5)
     finally:
         env.close()
-    first = make()
-    first.set_seed(3)
-    alone = first.reset()
-    assert torch.equal(out["goal"][0, :, 0], alone["goal"])
-    for t in range(5):
-        assert torch.equal(out["pixels"][0, :, t], alone["pixels"])
-        alone = first.step(alone.set("action", out["action"][0, :, t]))["next"]
+    seed = 3
+    for worker in range(2):
+        env = make()
+        seed = env.set_seed(seed)
+        alone = env.reset()
+        assert torch.equal(out["goal"][worker, :, 0], alone["goal"])
+        for t in range(5):
+            assert torch.equal(out["pixels"][worker, :, t], alone["pixels"])
+            alone = env.step(alone.set("action", out["action"][worker, :, t]))["next"]
 
 
 @pytest.mark.parametrize(

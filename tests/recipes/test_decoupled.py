@@ -115,11 +115,12 @@ def test_a_world_model_that_is_no_longer_the_same_is_noticed(smoke, tmp_path):
     source = tmp_path / "source"
     shutil.copytree(folder / "runs/decoupled/balance_reaching/position_velocity_recurrent_smoke", source)
     data = str(folder / "datasets/balance_reaching_smoke")
-    main(config := Config(smoke=True, world_model=source, run=tmp_path / "run", dataset=data))
+    settings = {"smoke": True, "world_model": source, "run": tmp_path / "run", "dataset": data}
+    main(Config(**settings))
     weights = source / "world_model/weights.safetensors"
     save_file({name: value + 1 for name, value in load_file(weights).items()}, weights)
     with pytest.raises(ValueError, match="was made with another world model"):
-        main(config)
+        main(Config(**settings))
 
 
 def test_the_dataset_that_is_there_is_taken(recording, tmp_path, monkeypatch):

@@ -27,7 +27,7 @@ def read_columns(root: str | Path) -> TensorDict:
         ``[N, 1]``: the steps in which a push acted, so far as the recording tells.
 
     Raises:
-        ValueError: columns are missing, or the files are not on this machine.
+        ValueError: columns are missing, numbers are not finite, or the files are not on this machine.
     """
     files = sorted((Path(root) / "data").glob("*/*.parquet"))
     if not files:
@@ -39,6 +39,8 @@ def read_columns(root: str | Path) -> TensorDict:
     if not (table["index"].to_numpy() == np.arange(len(table))).all():
         raise ValueError(f"{root}: the column index does not count the frames; repair or record the dataset")
     data = {key: torch.from_numpy(np.stack(table[name].to_numpy())).float() for key, name in NEEDED.items()}
+    if broken := [NEEDED[key] for key, values in data.items() if not values.isfinite().all()]:
+        raise ValueError(f"{root} has numbers in {', '.join(broken)} that are not finite; record it again")
     data["goal"] = data.pop("agent_pos")[:, -2:]
     data["disturbed"] = _mark_pushes(Path(root), table)
     return TensorDict(data, [len(table)])
