@@ -59,6 +59,40 @@ def test_claims_are_those_of_the_results():
     drops = [rates(policy, *without, name="DR") for policy in ("feedforward", "recurrent")]
     drop = f"drops the block in {min(drops[0]):.0f} to {max(drops[0]):.0f} % of the episodes"
     assert f"{drop} and a recurrent one in under 1 %" in text and max(drops[1]) < 1
+    joint = {
+        row: rates("recurrent", row, training="joint")[0] for row in ("End-to-End", *with_position, *without)
+    }
+    assert min(joint[row] for row in with_position) > 99
+    gaps = [joint[row] - rates("recurrent", row)[0] for row in without]
+    first = joint["End-to-End"] - rates("recurrent", "Only-RGB")[0]
+    better = f"training is {min(gaps):.0f} to {max(gaps):.0f} points better, and so is end-to-end training ({first:.0f})"
+    assert better in text
+    seeds = [
+        seed["test"]["summary"]["SR"]
+        for seed in cells["balance_reaching", "joint", "recurrent", "RGB+[V+A]"]["results"]
+    ]
+    assert (
+        f"one of the three seeds reached {min(seeds):.0f} % and the others above {min(sorted(seeds)[1:]) - 0.5:.0f}"
+        in text
+    )
+    second = {
+        training: {
+            row: cells["balance_reaching_obstacle", training, "recurrent", row]["test_protocol"]["SR"]
+            for row in (*with_position, *without)
+        }
+        for training in ("decoupled", "joint")
+    }
+    gaps = {row: second["decoupled"][row] - second["joint"][row] for row in second["joint"]}
+    with_p, without_p = [gaps[row] for row in with_position], [-gaps[row] for row in without]
+    assert (
+        f"decoupled ones are {min(with_p):.0f} to {max(with_p):.0f} points better where position was" in text
+    )
+    assert f"joint ones {min(without_p):.0f} to {max(without_p):.0f} where it was not" in text
+    plain = second["decoupled"]["Only-RGB"]
+    worth = [second["decoupled"][row] - plain for row in with_position]
+    costs = [plain - second["decoupled"][row] for row in without[1:]]
+    assert f"each with position at least {min(worth):.0f};" in text
+    assert f"velocity and acceleration cost {min(costs):.0f} to {max(costs):.0f}" in text
     main = cells["balance_reaching", "decoupled", "recurrent", "RGB+[P+V]"]["test_protocol"]
     assert f"an SR of {main['SR']:.1f} % and a PE of {main['PE']:.0f} mm" in text
     for name, task in (("balance_reaching_obstacle", 2), ("bin_dropping", 3)):
@@ -66,7 +100,7 @@ def test_claims_are_those_of_the_results():
             cells[name, "decoupled", "recurrent", row]["test_protocol"]["SR"]
             for row in ("RGB+[P+V]", "Only-RGB")
         )
-        assert re.search(rf"is worth .*?{with_dynamics - plain:.0f} (points )?on task {task}", text)
+        assert re.search(rf"is worth {with_dynamics - plain:.0f} (points )?on task {task}", text)
         file = f"recipes/results/{name}_own_position_velocity_recurrent.json"
         rate = json.loads((ROOT / file).read_text())["test_protocol"]["SR"]
         assert f"[{rate:.1f} %]({file}) in task {task}" in text
@@ -85,11 +119,10 @@ def commands():
             yield found[1], shlex.split(found[2], comments=True)
 
 
-@pytest.mark.parametrize(("recipe", "arguments"), commands(), ids=lambda part: str(part))
+@pytest.mark.parametrize(("recipe", "arguments"), list(commands()), ids=lambda part: str(part))
 def test_the_commands_are_understood(recipe, arguments):
     config_class = importlib.import_module(f"recipes.{recipe}").Config
-    config = draccus.parse(config_class, args=read_arguments(arguments, config_class), exit_on_error=False)
-    assert config != config_class() or not arguments
+    draccus.parse(config_class, args=read_arguments(arguments, config_class), exit_on_error=False)
 
 
 def test_rates_of_the_experts_are_those_of_the_results():
