@@ -92,7 +92,22 @@ def test_claims_are_those_of_the_results():
     worth = [second["decoupled"][row] - plain for row in with_position]
     costs = [plain - second["decoupled"][row] for row in without[1:]]
     assert f"each with position at least {min(worth):.0f};" in text
-    assert f"velocity and acceleration cost {min(costs):.0f} to {max(costs):.0f}" in text
+    third = {
+        (training, row): cells["bin_dropping", training, "recurrent", row]["test_protocol"]["SR"]
+        for training in ("decoupled", "joint")
+        for row in (*with_position, *without)
+    }
+    gaps = [third["decoupled", row] - third["joint", row] for row in with_position]
+    assert f"on task 3 decoupled ones are {min(gaps):.0f} to {max(gaps):.0f} better with position" in text
+    alone, together = (
+        third["decoupled", row] - third["decoupled", "Only-RGB"] for row in ("RGB+[P]", "RGB+[P+V+A]")
+    )
+    assert f"and position alone {alone:.0f}, but all three together lose {-together:.0f}." in text
+    worse = [third["decoupled", "Only-RGB"] - third["decoupled", row] for row in without[1:]]
+    two, three = (
+        f"{min(lost):.0f} to {max(lost):.0f} on task {task}" for lost, task in ((costs, 2), (worse, 3))
+    )
+    assert f"velocity and acceleration cost {two} and {three}" in text
     main = cells["balance_reaching", "decoupled", "recurrent", "RGB+[P+V]"]["test_protocol"]
     assert f"an SR of {main['SR']:.1f} % and a PE of {main['PE']:.0f} mm" in text
     for name, task in (("balance_reaching_obstacle", 2), ("bin_dropping", 3)):
