@@ -13,6 +13,7 @@ import os
 import re
 import shlex
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 
 HINTS = {
@@ -106,6 +107,13 @@ def check_at_least_one(config, *names: str) -> None:
     for name in names:
         if (value := getattr(config, name, 1)) < 1:
             raise ValueError(f"--{name} must be at least 1, not {value}")
+
+
+def refuse(config, names: Iterable[str], why: str) -> None:
+    """Raises ``ValueError`` for one of these settings that is not its default, and would say nothing here."""
+    for name in names:
+        if getattr(config, name) != getattr(type(config), name):
+            raise ValueError(f"--{name} {why}; leave it out")
 
 
 def command_line() -> str:

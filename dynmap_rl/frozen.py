@@ -14,6 +14,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from dynmap_rl import data, modules, runs
+from dynmap_rl.envs.tasks import NO_TASK
 from dynmap_rl.evaluation import evaluate, policy_errors
 from dynmap_rl.modules import Actor, WorldModel
 from dynmap_rl.training import fingerprint, train_policy
@@ -77,7 +78,7 @@ def train_policies(
         device = runs.choose_device(settings.device)
         world_model.to(device)
         generator = torch.Generator(device).manual_seed(0)
-        recolor = settings.task != data.NO_TASK
+        recolor = settings.task != NO_TASK
         features = data.compute_features(
             world_model, episodes["train"], settings.copies, generator, recolor=recolor
         )
@@ -114,7 +115,7 @@ def _train_and_evaluate(arguments: tuple) -> None:
     held_out = TensorDict.load_memmap(folder / "features" / "eval")
     train_policy(policy, features, held_out, folder / f"seed_{seed}", settings, seed)
     modules.save_policy(folder / f"seed_{seed}" / "policy", policy, world_model)
-    if settings.task == data.NO_TASK:
+    if settings.task == NO_TASK:
         result = {"held_out": policy_errors(policy, held_out)}
     else:
         episodes = settings.test_episodes, settings.paper_episodes

@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 
 from dynmap_rl import data, modules, runs
+from dynmap_rl.envs.tasks import NO_TASK
 from dynmap_rl.evaluation import evaluate, policy_errors
 from dynmap_rl.settings import load_episodes
 from dynmap_rl.training import fingerprint, prediction_errors, train_jointly
@@ -52,7 +53,7 @@ def _train_and_evaluate(arguments: tuple) -> None:
     world_model.eval(), policy.eval()
     modules.save_world_model(folder / "world_model", world_model)
     modules.save_policy(folder / "policy", policy, world_model)
-    if settings.task == data.NO_TASK:
+    if settings.task == NO_TASK:
         features = data.compute_features(world_model, episodes["eval"])
         errors = prediction_errors(world_model, episodes["eval"], by_entry=True)
         result = {"held_out": errors | policy_errors(policy, features)}

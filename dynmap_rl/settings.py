@@ -7,8 +7,7 @@ from pathlib import Path
 from tensordict import TensorDictBase
 
 from dynmap_rl import commands, data, modules, runs
-from dynmap_rl.data import NO_TASK
-from dynmap_rl.envs.tasks import get_task
+from dynmap_rl.envs.tasks import NO_TASK, get_task
 from dynmap_rl.envs.world import EPISODE_STEPS
 from dynmap_rl.evaluation import SHARED_STARTS, parse_supervision
 from dynmap_rl.loggers import check_logger

@@ -13,8 +13,8 @@ from torch import nn
 from tqdm import tqdm
 
 from dynmap_rl import runs
-from dynmap_rl.data import NO_TASK, add_distractors, augment, compute_features, sample_windows
-from dynmap_rl.envs.tasks import get_task
+from dynmap_rl.data import add_distractors, augment, compute_features, sample_windows
+from dynmap_rl.envs.tasks import NO_TASK, get_task
 from dynmap_rl.loggers import log_metrics
 from dynmap_rl.modules import WorldModel, mixed_precision
 from dynmap_rl.objectives import ImitationLoss, JointLoss, WorldModelLoss

@@ -10,7 +10,7 @@ recipes/joint.py are supervised on. The dataset stays as it is; the new one appe
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynmap_rl.commands import run_recipe
+from dynmap_rl.commands import refuse, run_recipe
 
 
 @dataclass
@@ -49,12 +49,10 @@ def main(config: Config) -> None:
 
     if not config.dataset or not config.output:
         raise ValueError("name the dataset with --dataset and the new folder with --output")
-    of_state, of_frames = ("state", "columns", "angles", "period"), ("camera", "threshold")
-    for name in of_state if config.track else of_frames:
-        if getattr(config, name) != getattr(Config, name):
-            raise ValueError(
-                f"--{name} says nothing {'with' if config.track else 'without'} --track; leave it out"
-            )
+    if config.track:
+        refuse(config, ("state", "columns", "angles", "period"), "says nothing with --track")
+    else:
+        refuse(config, ("camera", "threshold"), "says nothing without --track")
     settings = vars(config) | {
         "columns": parse_entries(config.columns, "--columns"),
         "angles": parse_entries(config.angles, "--angles") or [],

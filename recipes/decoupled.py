@@ -12,7 +12,7 @@ goes on where it was stopped, or says that it is done.
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynmap_rl.commands import replace_defaults, run_recipe
+from dynmap_rl.commands import refuse, replace_defaults, run_recipe
 
 
 @dataclass
@@ -96,16 +96,16 @@ SMOKE = {
 def main(config: Config) -> None:
     import torch
 
-    from dynmap_rl import data, frozen, modules, runs, settings
+    from dynmap_rl import frozen, modules, runs, settings
+    from dynmap_rl.envs.tasks import NO_TASK
     from dynmap_rl.evaluation import parse_supervision, print_row, write_report
     from dynmap_rl.training import train_world_model
 
-    given = [name for name in WORLD_MODEL if getattr(config, name) != getattr(Config, name)]
-    if config.world_model and given:
-        raise ValueError(f"--{given[0]} is of a world model's training, and that of --world_model is done")
+    if config.world_model:
+        refuse(config, WORLD_MODEL, "is of a world model's training, and that of --world_model is done")
     if config.smoke:
         replace_defaults(config, SMOKE)
-    if config.task == data.NO_TASK:
+    if config.task == NO_TASK:
         replace_defaults(config, settings.FOREIGN)
     supervision = parse_supervision(config.supervision)
     seeds = settings.check_settings(config)

@@ -75,12 +75,13 @@ SMOKE = {
 
 
 def main(config: Config) -> None:
-    from dynmap_rl import data, joint, modules, runs, settings
+    from dynmap_rl import joint, modules, runs, settings
+    from dynmap_rl.envs.tasks import NO_TASK
     from dynmap_rl.evaluation import parse_supervision, print_row, write_report
 
     if config.smoke:
         replace_defaults(config, SMOKE)
-    if config.task == data.NO_TASK:
+    if config.task == NO_TASK:
         replace_defaults(config, settings.FOREIGN)
     supervision = parse_supervision(config.supervision)
     seeds = settings.check_settings(config)

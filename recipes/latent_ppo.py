@@ -146,15 +146,11 @@ def make_env(world_model, task: str, num_envs: int, keep_pixels: bool = False):
 
 def roll_out(network, world_model, task: str, seeds: list[int]) -> list:
     """Run the mean action on one scene a seed for 120 steps; the worlds are as they are at the end."""
-    import torch
-
-    from dynmap_rl.envs.world import EPISODE_STEPS
+    from dynmap_rl.experts.ppo import play
 
     env = make_env(world_model, task, len(seeds))
-    with torch.no_grad():
-        td = env.reset(scene_seed=torch.tensor(seeds))
-        for _ in range(EPISODE_STEPS):
-            td = env.step(td.set("action", network(td["state"])[0]))["next"]
+    for _ in play(env, network, seeds):
+        pass
     return env.base_env.worlds
 
 

@@ -21,7 +21,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 from dynmap_rl.cells import Cell, list_cells
-from dynmap_rl.commands import check_at_least_one, replace_defaults, run_recipe
+from dynmap_rl.commands import check_at_least_one, refuse, replace_defaults, run_recipe
 
 RECIPES = Path(__file__).parent
 SMOKE = Path("runs/tables_smoke")
@@ -147,8 +147,7 @@ def check_config(config: Config) -> None:
     if config.launcher not in LAUNCHERS:
         raise ValueError(f"--launcher is {' or '.join(LAUNCHERS)}, not {config.launcher!r}")
     ignored = {"local": ("cpus", "gpus"), "ray": ("workers",)}[config.launcher]
-    if given := [name for name in ignored if getattr(config, name) != getattr(Config, name)]:
-        raise ValueError(f"--{given[0]} says nothing to --launcher {config.launcher}; leave it out")
+    refuse(config, ignored, f"says nothing to --launcher {config.launcher}")
 
 
 def main(config: Config) -> None:

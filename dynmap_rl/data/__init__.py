@@ -4,7 +4,6 @@ import importlib
 
 _MODULES = {
     "META": "loading",
-    "NO_TASK": "foreign",
     "add_distractors": "augmentation",
     "as_replay_buffer": "replay",
     "add_dynamics": "dynamics",

@@ -122,9 +122,9 @@ def add_dynamics(
         for quantity, part in zip(DYNAMICS, parts, strict=True):
             values[quantity][rows] = part
     # A recording's constants and scenes say nothing of dynamics that are no longer those of cart and block.
-    without = () if [len(names)] == [info["features"][name]["shape"][0] for name in old[:1]] else (META,)
+    same = old and info["features"][old[0]]["shape"] == [len(names)]
     new = {f"dynamics.{q}": v.astype(np.float32) for q, v in values.items()}
-    write_columns(root, output, info, table, new, names, without)
+    write_columns(root, output, info, table, new, names, without=() if same else (META,))
     there = {q: read(f"dynamics.{q}") for q in DYNAMICS if f"dynamics.{q}" in old}
     return {q: np.abs(values[q] - v).mean(0) for q, v in there.items() if v.shape == values[q].shape}
 

@@ -19,7 +19,6 @@ from .frames import choose_camera, iterate_frames
 from .loading import FRAME_SHAPE
 from .reading import find_dataset, read_column, read_info, read_table, spans
 
-NO_TASK = "none"  # what --task names where the dataset is of no task of ours
 LONGEST = 120  # steps of a piece: longer ones make batches of whole pieces slow
 
 

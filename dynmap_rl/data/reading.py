@@ -139,7 +139,7 @@ def decode_image(file: pa.Buffer | None, largest: int) -> np.ndarray:
     try:
         if data[:8].tobytes() == PNG and data.size >= 24:
             width, height = data[16:24].view(">u4").tolist()
-        else:  # twice as long as decoding a small PNG
+        else:  # which takes as long as decoding a small PNG
             width, height = Image.open(io.BytesIO(data)).size
     except (OSError, Image.DecompressionBombError) as error:
         raise ValueError("cannot be decoded") from error

@@ -13,8 +13,9 @@ def as_replay_buffer(
     """Episodes ``[E, T]`` as a buffer whose ``sample()`` is ``batch`` random windows ``[batch, length]``.
 
     Each window lies in one episode; episodes, and the places in them, are equally likely. The buffer holds the
-    episodes themselves, not a copy; samples are copies, with two entries more: ``trajectory`` (the
-    number of the episode) and ``index`` ``[batch, length]``. ``append_transform`` takes any transform of windows, :class:`dynmap_rl.envs.WorldModelTransform` too.
+    episodes themselves, not a copy; samples are copies, with two entries more, ``[batch, length]``:
+    ``trajectory``, the number of the episode, and ``index``. ``append_transform`` takes any transform of windows,
+    :class:`dynmap_rl.envs.WorldModelTransform` too.
 
     Args:
         episodes: what :func:`dynmap_rl.data.load_dataset` gave.

@@ -265,6 +265,9 @@ def squared(dynamics: np.ndarray, limits: np.ndarray) -> float:
 TASKS = {task.name: task for task in (BalanceReaching(), BalanceReachingObstacle(), BinDropping())}
 
 
+NO_TASK = "none"  # what --task names where a dataset is of no task of ours
+
+
 def get_task(name: str, from_file: bool = False) -> BalanceReaching:
     """The task of a name, or of a subclass of :class:`BalanceReaching` that is named as ``"module:Class"``.
 

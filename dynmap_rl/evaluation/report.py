@@ -10,8 +10,9 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from dynmap_rl.commands import command_line
-from dynmap_rl.data import NO_TASK, load_meta
+from dynmap_rl.data import load_meta
 from dynmap_rl.envs import scene_seed
+from dynmap_rl.envs.tasks import NO_TASK
 from dynmap_rl.modules import Actor, WorldModel, load_policy
 from dynmap_rl.runs import read_json, write_json
 

@@ -38,7 +38,7 @@ def summarize_seeds(rows_by_seed: list[list[dict]]) -> dict[str, tuple[float, fl
 
 
 def wilson(successes: float, count: float) -> tuple[float, float]:
-    """95 % Wilson interval of a rate, in %."""
+    """95 % Wilson interval of a rate, in %; SciPy's is for whole numbers alone."""
     rate, z = successes / count, float(norm.ppf(0.975))
     middle = rate + z**2 / (2 * count)
     half = z * (rate * (1 - rate) / count + z**2 / (4 * count**2)) ** 0.5

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import torch
@@ -20,7 +20,6 @@ from dynmap_rl.envs import scene_seed
 from dynmap_rl.envs.tasks import BalanceReaching
 from dynmap_rl.envs.world import EPISODE_STEPS, World
 from dynmap_rl.evaluation import wilson
-from dynmap_rl.evaluation.figures import save_gif
 from dynmap_rl.loggers import log_metrics
 from dynmap_rl.training import check_loss
 from dynmap_rl.weights import save_weights
@@ -171,17 +170,23 @@ def rates_text(row: dict) -> str:
 
 
 @torch.no_grad()
-def film(env: EnvBase, network: ExpertNetwork, seeds: list[int], path: Path) -> None:
-    """An animation of the mean action's episodes, one a scene seed.
+def play(env: EnvBase, network: ExpertNetwork, seeds: list[int]) -> Iterator[TensorDictBase]:
+    """What is observed in each of the 120 steps of the mean action's episodes, one a scene seed.
 
     Args:
-        env: ``[len(seeds)]`` worlds with ``state`` and ``pixels``.
-        path: of the GIF.
+        env: ``[len(seeds)]`` worlds with ``state``, controlled by accelerations.
     """
-    td, frames = env.reset(scene_seed=torch.tensor(seeds)), []
+    td = env.reset(scene_seed=torch.tensor(seeds))
     for _ in range(EPISODE_STEPS):
-        frames.append(td["pixels"])
+        yield td
         td = env.step(td.set("action", network(td["state"])[0]))["next"]
+
+
+def film(env: EnvBase, network: ExpertNetwork, seeds: list[int], path: Path) -> None:
+    """:func:`play` as an animation; the environment also has ``pixels``."""
+    from dynmap_rl.evaluation.figures import save_gif
+
+    frames = [td["pixels"] for td in play(env, network, seeds)]
     save_gif(TensorDict({"pixels": torch.stack(frames, 1)}, [len(seeds), EPISODE_STEPS]), path)
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import torch
 
+from dynmap_rl.envs.tasks import NO_TASK
 from dynmap_rl.hub import first_line, is_hub_id
 from dynmap_rl.runs import read_json, write_json
 from dynmap_rl.weights import load_module, save_weights
@@ -145,7 +146,7 @@ def task_of_run(run: Path) -> str | None:
         ValueError: it was trained on a dataset of no task of ours, and there is no simulator for it.
     """
     settings = read_json(run / "config.json") if (run / "config.json").exists() else {}
-    if (task := settings.get("task")) == "none":
+    if (task := settings.get("task")) == NO_TASK:
         raise ValueError(
             f"{run} was trained on {settings.get('dataset')}, for which there is no simulator; its eval.json has its "
             "errors on held-out episodes"

@@ -81,7 +81,7 @@ class DynmapPolicy(PreTrainedPolicy):
         return sum(losses.values()), {name: value.item() for name, value in losses.items()}
 
     def make_windows(self, batch: dict[str, torch.Tensor]) -> TensorDict:
-        """A batch of LeRobot's as our losses want it: ``[B, T]`` with ``pixels``, ``action``, ``goal``, ``dynamics``
+        """A batch of LeRobot's as our losses want it: ``[B, T]`` with ``pixels``, ``action``, ``goal``, ``dynamics``,
         ``disturbed``, and the mask that is false beyond the end of an episode, which the losses leave out.
 
         Raises:
