@@ -1,15 +1,20 @@
 """Dynamics Mapping: world models for visual imitation learning, supervised on the dynamics of the scene.
 
-Importing the package registers the Gymnasium ids; its parts (``envs``, ``modules``, ``objectives``, ``data``, ``experts``,
-``evaluation``) are imported when first used.
+The parts (``envs``, ``modules``, ``objectives``, ``data``, ``experts``, ``evaluation``) are imported when first used, and
+the Gymnasium ids registered when Gymnasium is, before or after this package: importing it alone takes no time.
 """
 
 import importlib
-
-import gymnasium
+import sys
 
 __version__ = "0.1.0"
 __all__ = ["data", "envs", "evaluation", "experts", "modules", "objectives"]
+
+GYMNASIUM_IDS = {
+    "dynmap_rl/BalanceReaching-v0": "balance_reaching",
+    "dynmap_rl/BalanceReachingObstacle-v0": "balance_reaching_obstacle",
+    "dynmap_rl/BinDropping-v0": "bin_dropping",
+}
 
 
 def __getattr__(name: str):
@@ -22,10 +27,33 @@ def __dir__() -> list[str]:
     return [*__all__, "GYMNASIUM_IDS", "__version__"]
 
 
-GYMNASIUM_IDS = {
-    "dynmap_rl/BalanceReaching-v0": "balance_reaching",
-    "dynmap_rl/BalanceReachingObstacle-v0": "balance_reaching_obstacle",
-    "dynmap_rl/BinDropping-v0": "bin_dropping",
-}
-for _id, _task in GYMNASIUM_IDS.items():
-    gymnasium.register(_id, "dynmap_rl.envs.gymnasium_env:DynmapEnv", kwargs={"task": _task})
+def _register(gymnasium) -> None:
+    for name, task in GYMNASIUM_IDS.items():
+        gymnasium.register(name, "dynmap_rl.envs.gymnasium_env:DynmapEnv", kwargs={"task": task})
+
+
+class _RegisterWithGymnasium:
+    """Finds Gymnasium as Python does, and registers the ids once it is imported, which takes 0.4 s."""
+
+    @classmethod
+    def find_spec(cls, name, path=None, target=None):
+        if name != "gymnasium":
+            return None
+        others = (finder for finder in sys.meta_path if finder is not cls)
+        spec = next((spec for finder in others if (spec := finder.find_spec(name, path))), None)
+        if spec:
+            execute = spec.loader.exec_module
+
+            def execute_and_register(module):
+                sys.meta_path.remove(cls)
+                execute(module)
+                _register(module)
+
+            spec.loader.exec_module = execute_and_register
+        return spec
+
+
+if "gymnasium" in sys.modules:
+    _register(sys.modules["gymnasium"])
+else:
+    sys.meta_path.insert(0, _RegisterWithGymnasium)

@@ -17,7 +17,7 @@ def _run(*arguments: str) -> float:
 
 
 def import_package() -> dict:
-    """Seconds for ``import dynmap_rl``, which registers the Gymnasium ids, against ``import gymnasium`` alone."""
+    """Seconds for ``import dynmap_rl`` against ``import gymnasium``, with which its ids are registered."""
     return compare(lambda: _run("-c", "import dynmap_rl"), lambda: _run("-c", "import gymnasium"))
 
 

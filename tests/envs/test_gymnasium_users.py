@@ -1,5 +1,7 @@
 """The Gymnasium ids in other people's hands: vector environments, windows, wrappers, Stable-Baselines3."""
 
+import subprocess
+import sys
 import warnings
 
 import gymnasium as gym
@@ -25,6 +27,21 @@ def play(env: gym.vector.VectorEnv, steps: int) -> list[np.ndarray]:
     states += [env.step(action)[0] for action in actions]
     env.close()
     return states
+
+
+@pytest.mark.parametrize(
+    "imports",
+    [
+        "import gymnasium, dynmap_rl",
+        "import dynmap_rl, sys; assert 'gymnasium' not in sys.modules; import gymnasium",
+        "import dynmap_rl, importlib.util; importlib.util.find_spec('gymnasium'); import gymnasium",
+        "import dynmap_rl; from gymnasium.envs import registration; import gymnasium",
+        "import gymnasium; gymnasium.make('dynmap_rl:dynmap_rl/BinDropping-v0')",
+    ],
+)
+def test_the_ids_are_there_whatever_is_imported_first(imports):
+    use = "import sys; [gymnasium.make(name) for name in dynmap_rl.GYMNASIUM_IDS]; assert 'dynmap_rl' not in str(sys.meta_path)"
+    subprocess.run([sys.executable, "-c", f"{imports}; import dynmap_rl; {use}"], check=True)
 
 
 @every_id
