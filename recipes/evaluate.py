@@ -7,9 +7,11 @@
 
 A policy sees frames and acts in closed loop: drop rate, position error and success rate, as in our tables. An expert,
 by default the task's own, sees the state: success, drop and touch rates, for task 2 also how often the straight path
-to the goal is blocked and how often the shortest way leads around the obstacle. Rates have 95 % Wilson intervals.
+to the goal is blocked and how often the shortest way leads around the obstacle. Rates have 95 % Wilson intervals. A
+folder of runs/evaluate keeps the numbers and a page with some of the episodes, failures first.
 """
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,28 +40,37 @@ class Config:
     split: str = "test"
     # cpu, cuda, or auto: the GPU where there is one. For policies of ours.
     device: str = "auto"
-    # JSON file; by default one in runs/evaluate.
+    # JSON file of the numbers; by default eval.json beside the page.
     output: Path | None = None
 
 
 def main(config: Config) -> None:
+    from dynmap_rl.evaluation import write_html
     from dynmap_rl.runs import write_json
 
     if config.episodes < 1:
         raise ValueError(f"--episodes must be at least 1, not {config.episodes}")
     if config.policy and (config.expert or config.checkpoint):
         raise ValueError("--policy and --expert: name one of them")
-    name, result = (judge_policy if config.policy else judge_expert)(config)
-    output = config.output or Path("runs/evaluate") / f"{name}_{config.split}.json"
+    folder, text, result = (judge_policy if config.policy else judge_expert)(config)
+    print(text)
+    who = f"Policy {config.policy}" if config.policy else f"Expert {result['expert']}"
+    write_html(folder, f"{who}, {result['task']}", text, command_line(), dataclasses.asdict(config))
     common = {"split": config.split, "episodes": config.episodes, "command": command_line()}
+    output = config.output or folder / "eval.json"
     write_json(output, result | common)
-    print(f"written: {output}")
+    print(f"written: {output}, {folder / 'report.html'}")
 
 
-def judge_policy(config: Config) -> tuple[str, dict]:
-    """The name of the result, and the result: ``DR``, ``PE``, ``SR`` and what became of every episode."""
+def name_folder(config: Config, *names: str) -> Path:
+    return Path("runs/evaluate") / "_".join([*names, config.split]).replace("/", "")
+
+
+def judge_policy(config: Config) -> tuple[Path, str, dict]:
+    """The folder with an animation, the numbers as text, and the result: ``DR``, ``PE``, ``SR`` and what became of
+    every episode."""
     from dynmap_rl.envs.tasks import get_task
-    from dynmap_rl.evaluation import evaluate
+    from dynmap_rl.evaluation import evaluate, film_policy
     from dynmap_rl.modules import find_run, load_actor, task_of_run
     from dynmap_rl.runs import choose_device
 
@@ -80,11 +91,11 @@ def judge_policy(config: Config) -> tuple[str, dict]:
     result = evaluate(actor, task, config.episodes, 0, config.split)["test"]
     summary = result["summary"]
     low, high = summary["SR_interval"]
-    print(
-        f"DR {summary['DR']:.1f} %   PE {summary['PE']:.1f} mm   SR {summary['SR']:.1f} % [{low:.1f}, {high:.1f}]"
-    )
-    name = "_".join([get_task(task).name, *Path(config.policy).parts[-4:], f"seed_{config.seed}"])
-    return name.replace("/", ""), {"task": task, "policy": config.policy, **result}
+    text = f"DR {summary['DR']:.1f} %   PE {summary['PE']:.1f} mm   SR {summary['SR']:.1f} % [{low:.1f}, {high:.1f}]"
+    parts = Path(config.policy).parts[-4:]
+    folder = name_folder(config, get_task(task).name, *parts, f"seed_{config.seed}")
+    film_policy(actor, task, result["rows"], folder / "rollouts.gif")
+    return folder, text, {"task": task, "policy": config.policy, **result}
 
 
 def load_lerobot(policy: str, instruction: str):
@@ -97,19 +108,20 @@ def load_lerobot(policy: str, instruction: str):
     return LeRobotActor(policy, instruction=instruction)
 
 
-def judge_expert(config: Config) -> tuple[str, dict]:
-    """The name of the result, and the result: ``rates`` and ``intervals`` (%)."""
+def judge_expert(config: Config) -> tuple[Path, str, dict]:
+    """The folder with an animation, the numbers as text, and the result: ``rates`` and ``intervals`` (%)."""
     from dynmap_rl.envs.geometry import path_is_blocked, way_from_start
     from dynmap_rl.envs.scene import ObstacleScene
     from dynmap_rl.envs.tasks import get_task
-    from dynmap_rl.evaluation import scene_seeds, wilson
-    from dynmap_rl.experts import list_checkpoints, load_expert, roll_out, task_of_expert
+    from dynmap_rl.evaluation import failures_first, scene_seeds, wilson
+    from dynmap_rl.experts import film, list_checkpoints, load_expert, roll_out, task_of_expert
 
     task = get_task(config.task or "balance_reaching")
     expert = config.expert or task.name
     checkpoint = config.checkpoint or list_checkpoints(expert)[-1]
     network, trained_on = load_expert(expert, checkpoint), task_of_expert(expert, task)
-    worlds = roll_out(network, task, scene_seeds(config.split, config.episodes), states=trained_on)
+    seeds = scene_seeds(config.split, config.episodes)
+    worlds = roll_out(network, task, seeds, states=trained_on)
     outcomes = {
         "success": [task.is_success(world) for world in worlds],
         "dropped": [world.dropped for world in worlds],
@@ -120,12 +132,15 @@ def judge_expert(config: Config) -> tuple[str, dict]:
         outcomes["way_leads_around"] = [len(way_from_start(world.scene)) > 2 for world in worlds]
     rates = {name: 100 * sum(values) / len(worlds) for name, values in outcomes.items()}
     intervals = {name: wilson(sum(values), len(worlds)) for name, values in outcomes.items()}
-    for name, rate in rates.items():
-        low, high = intervals[name]
-        print(f"{name.replace('_', ' '):22} {rate:5.1f} % [{low:.1f}, {high:.1f}]")
+    lines = [
+        f"{name.replace('_', ' '):22} {rate:5.1f} % [{intervals[name][0]:.1f}, {intervals[name][1]:.1f}]"
+        for name, rate in rates.items()
+    ]
+    folder = name_folder(config, task.name, *Path(expert).parts[-4:], checkpoint)
+    some = failures_first(seeds, outcomes["success"])
+    film(network, task, some, folder / "rollouts.gif", states=trained_on)
     result = {"task": config.task or task.name, "expert": expert, "checkpoint": checkpoint}
-    name = "_".join([task.name, *Path(expert).parts[-4:], checkpoint]).replace("/", "")
-    return name, result | {"rates": rates, "intervals": intervals}
+    return folder, "\n".join(lines), result | {"rates": rates, "intervals": intervals}
 
 
 if __name__ == "__main__":

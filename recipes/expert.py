@@ -56,17 +56,9 @@ def main(config: Config) -> None:
     from dynmap_rl import runs
     from dynmap_rl.envs import DynmapBatchedEnv
     from dynmap_rl.envs.world import ACCELERATION_LIMIT
-    from dynmap_rl.evaluation import write_html
-    from dynmap_rl.experts import ExpertNetwork, list_checkpoints, roll_out
-    from dynmap_rl.experts.ppo import (
-        POSITIVE,
-        failures_first,
-        film,
-        fresh_scenes,
-        rates,
-        rates_text,
-        train_ppo,
-    )
+    from dynmap_rl.evaluation import failures_first, write_html
+    from dynmap_rl.experts import ExpertNetwork, film, list_checkpoints, roll_out
+    from dynmap_rl.experts.ppo import POSITIVE, fresh_scenes, rates, rates_text, train_ppo
     from dynmap_rl.loggers import check_logger
 
     check_logger(config.logger)
@@ -93,9 +85,8 @@ def main(config: Config) -> None:
     train_ppo(env, network, folder, config, judge, facts)
     last = runs.read_json(folder / "checkpoint" / f"{list_checkpoints(folder / 'checkpoint')[-1]}.json")
     seeds = fresh_scenes(config.eval_episodes)
-    some = failures_first(env.task, roll_out(network, env.task, seeds), seeds)
-    scenes = DynmapBatchedEnv(config.task, len(some), from_pixels=True, control="acceleration")
-    film(scenes, network, some, folder / "rollouts.gif")
+    success = [env.task.is_success(world) for world in roll_out(network, env.task, seeds)]
+    film(network, env.task, failures_first(seeds, success), folder / "rollouts.gif")
     write_html(folder, f"Expert, {env.task.name}", rates_text(last), command_line())
     print(f"{rates_text(last)}\ndone: {folder}")
 

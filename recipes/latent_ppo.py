@@ -73,8 +73,8 @@ def main(config: Config) -> None:
     from dynmap_rl import experts, frozen, runs
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.envs.world import ACCELERATION_LIMIT
-    from dynmap_rl.evaluation import write_html
-    from dynmap_rl.experts.ppo import POSITIVE, failures_first, film, fresh_scenes, rates, train_ppo
+    from dynmap_rl.evaluation import failures_first, write_html
+    from dynmap_rl.experts.ppo import POSITIVE, fresh_scenes, rates, train_ppo
     from dynmap_rl.loggers import check_logger
     from dynmap_rl.training import fingerprint
 
@@ -123,9 +123,8 @@ def main(config: Config) -> None:
         "command": command_line(),
     }
     seeds = fresh_scenes(config.eval_episodes)
-    some = failures_first(task, roll_out(network, world_model, config.task, seeds), seeds)
-    scenes = make_env(world_model, config.task, len(some), keep_pixels=True)
-    film(scenes, network, some, folder / "rollouts.gif")
+    success = [task.is_success(world) for world in roll_out(network, world_model, config.task, seeds)]
+    film(network, world_model, config.task, failures_first(seeds, success), folder / "rollouts.gif")
     write_html(folder, f"PPO on latents, {task.name}", result_text(result), result["command"])
     runs.write_json(folder / "eval.json", result)
     print(result_text(result))
@@ -144,14 +143,35 @@ def make_env(world_model, task: str, num_envs: int, keep_pixels: bool = False):
     return TransformedEnv(env, Compose(transform, states, *rest))
 
 
-def roll_out(network, world_model, task: str, seeds: list[int]) -> list:
-    """Run the mean action on one scene a seed for 120 steps; the worlds are as they are at the end."""
-    from dynmap_rl.experts.ppo import play
+def play(env, network, seeds: list[int]):
+    """What is observed in each of the 120 steps of the mean action's episodes, one a scene seed."""
+    import torch
 
+    from dynmap_rl.envs.world import EPISODE_STEPS
+
+    with torch.no_grad():
+        td = env.reset(scene_seed=torch.tensor(seeds))
+        for _ in range(EPISODE_STEPS):
+            yield td
+            td = env.step(td.set("action", network(td["state"])[0]))["next"]
+
+
+def roll_out(network, world_model, task: str, seeds: list[int]) -> list:
+    """:func:`play` to the end: the worlds as they are then."""
     env = make_env(world_model, task, len(seeds))
     for _ in play(env, network, seeds):
         pass
     return env.base_env.worlds
+
+
+def film(network, world_model, task: str, seeds: list[int], path: Path) -> None:
+    """:func:`play` as an animation."""
+    import torch
+
+    from dynmap_rl.evaluation.figures import save_gif
+
+    env = make_env(world_model, task, len(seeds), keep_pixels=True)
+    save_gif(torch.stack([td["pixels"] for td in play(env, network, seeds)], 1), path)
 
 
 def result_text(result: dict) -> str:

@@ -5,9 +5,11 @@
 
 Held-out demonstrations with their actions: after a second of frames each world model that decodes positions predicts
 two more without (mm and degrees, beside standing still). And a linear map of each state, fitted to the demonstrations
-of training, tells position, velocity and acceleration (R^2). Writes two figures and ``probe.json``.
+of training, tells position, velocity and acceleration (R^2). Writes two figures, ``probe.json`` and
+``report.html``.
 """
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,7 +36,7 @@ class Config:
 
 def main(config: Config) -> None:
     from dynmap_rl.data import load_dataset, record_dataset
-    from dynmap_rl.evaluation import open_loop_errors, row_name
+    from dynmap_rl.evaluation import open_loop_errors, row_name, write_html
     from dynmap_rl.evaluation.probing import plot_open_loop, plot_probes, probe
     from dynmap_rl.frozen import load_source
     from dynmap_rl.runs import write_json
@@ -57,19 +59,24 @@ def main(config: Config) -> None:
         if "position" in model.supervision
     }
     probes = {name: probe(model, train, test) for name, model in models.items()}
+    lines = []
     for name, errors in open_loop.items():
         last = {key: values[-1] for key, values in errors["model"].items()}
         cart, block, seconds = last["cart_mm"], last["block_mm"], 0.05 * config.horizon
-        print(
-            f"{name}: after {seconds:.1f} s without frames the cart is {cart:.0f} mm off, the block {block:.0f} mm"
-        )
+        off = f"the cart is {cart:.0f} mm off, the block {block:.0f} mm"
+        lines.append(f"{name}: after {seconds:.1f} s without frames {off}")
     for name, states in probes.items():
         for state, quantities in states.items():
             values = "  ".join(f"{q} {sum(r2) / len(r2):5.2f}" for q, r2 in quantities.items())
-            print(f"{name}: R^2 of {state:8} {values}")
+            lines.append(f"{name}: R^2 of {state:8} {values}")
+    text = "\n".join(lines)
+    print(text)
+    (config.output / "open_loop.png").unlink(missing_ok=True)  # of another --runs
     if open_loop:
         plot_open_loop(open_loop, config.output / "open_loop.png")
     plot_probes(probes, config.output / "probes.png")
+    settings = dataclasses.asdict(config)
+    write_html(config.output, "What world models know", text, command_line(), settings)
     facts = {"command": command_line(), "train_episodes": len(train), "test_episodes": len(test)}
     write_json(config.output / "probe.json", facts | {"open_loop": open_loop, "probes": probes})
     print(f"written: {config.output}")

@@ -154,7 +154,7 @@ def test_the_recipes_take_it_from_the_expert_to_the_row(tmp_path):
     assert result.returncode == 0, result.stderr
     expert = ["--expert", "runs/expert/lift/checkpoint"]
     run("evaluate", *expert, "--episodes", "2")
-    assert (tmp_path / "runs/evaluate/lift_runs_expert_lift_checkpoint_iteration_001_test.json").exists()
+    assert (tmp_path / "runs/evaluate/lift_runs_expert_lift_checkpoint_iteration_001_test/eval.json").exists()
     run("collect", *expert, "--episodes", "4", *episodes)
     dataset = tmp_path / "datasets/lift"
     scenes = [row["scene"] for row in load_meta(dataset)["episodes"]]

@@ -4,8 +4,8 @@ from .held_out import policy_errors, write_held_out
 from .html import write_html
 from .imagination import open_loop_errors
 from .paper import TABLES, paper_numbers, parse_supervision, row_name
-from .report import SHARED_STARTS, evaluate, print_row, write_report
-from .rollout import episode_rows, roll_out, scene_seeds
+from .report import SHARED_STARTS, evaluate, film_policy, print_row, write_report
+from .rollout import episode_rows, failures_first, roll_out, scene_seeds
 from .statistics import shared_interval, success_gap, summarize, summarize_seeds, wilson
 
 __all__ = [
@@ -13,6 +13,8 @@ __all__ = [
     "TABLES",
     "episode_rows",
     "evaluate",
+    "failures_first",
+    "film_policy",
     "open_loop_errors",
     "paper_numbers",
     "parse_supervision",

@@ -137,9 +137,9 @@ def plot_distributions(dynamics: dict[str, TensorDictBase], path: Path) -> dict[
     return ranges
 
 
-def save_gif(episodes: TensorDictBase, path: Path, columns: int = 4, scale: int = 3) -> None:
-    """Frames ``pixels`` ``[E, T, 3, 64, 64]`` of E episodes as one animation in real time."""
-    frames = episodes["pixels"].permute(1, 0, 3, 4, 2).numpy()  # (T, E, 64, 64, 3)
+def save_gif(pixels: torch.Tensor, path: Path, columns: int = 4, scale: int = 3) -> None:
+    """Frames ``[E, T, 3, 64, 64]`` of E episodes as one animation in real time."""
+    frames = pixels.permute(1, 0, 3, 4, 2).numpy()  # (T, E, 64, 64, 3)
     rows = -(-frames.shape[1] // columns)
     blank = np.full((frames.shape[0], rows * columns - frames.shape[1], 64, 64, 3), 255, np.uint8)
     grid = np.concatenate([frames, blank], 1).reshape(len(frames), rows, columns, 64, 64, 3)

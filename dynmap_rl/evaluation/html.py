@@ -19,18 +19,20 @@ PICTURES = {  # in this order
     "rollouts.gif": "Rollouts in closed loop, failures first",
     "figures/reconstruction.png": "Held-out frames, and what the world model predicted from the frame before",
     "figures/dynamics.png": "The block's dynamics along a held-out episode, true and predicted",
+    "open_loop.png": "Open-loop prediction: its error against the time without frames",
+    "probes.png": "How much of the dynamics a linear map reads out of each state",
 }
 
 
-def write_html(folder: Path, title: str, row: str, command: str = "") -> Path:
+def write_html(folder: Path, title: str, row: str, command: str = "", settings: dict | None = None) -> Path:
     """Write ``report.html``: the table row, animations and figures, curves, settings, the command.
 
     Args:
-        folder: of a run, with ``config.json`` and whatever of ``metrics.jsonl``, ``seed_N/metrics.jsonl`` and
-            figures there is.
+        folder: of a run, with whatever of ``metrics.jsonl``, ``seed_N/metrics.jsonl`` and figures there is.
         title: of the page.
         row: the result, as text.
         command: that made it.
+        settings: those of ``config.json`` in the folder unless others are given.
     """
     parts = [f"<h1>{html.escape(title)}</h1>", f"<pre>{html.escape(row.strip())}</pre>"]
     for name, caption in PICTURES.items():
@@ -43,7 +45,7 @@ def write_html(folder: Path, title: str, row: str, command: str = "") -> Path:
     curves = {path.name: read_metrics(path) for path in [folder, *sorted(folder.glob("seed_*"))]}
     if any(curves.values()):
         parts += ["<h2>Training</h2>", draw_curves({name: rows for name, rows in curves.items() if rows})]
-    settings = read_json(folder / "config.json")
+    settings = read_json(folder / "config.json") if settings is None else settings
     cells = "".join(
         f"<tr><td>{html.escape(name)}</td><td>{html.escape(str(value))}</td></tr>"
         for name, value in settings.items()

@@ -11,7 +11,6 @@ from tensordict.nn import TensorDictModuleBase
 
 from dynmap_rl.commands import command_line
 from dynmap_rl.data import load_meta
-from dynmap_rl.envs import scene_seed
 from dynmap_rl.envs.tasks import NO_TASK
 from dynmap_rl.modules import Actor, WorldModel, load_policy
 from dynmap_rl.runs import read_json, write_json
@@ -19,7 +18,7 @@ from dynmap_rl.runs import read_json, write_json
 from .held_out import held_out_text, write_held_out
 from .html import write_html
 from .paper import METRICS, paper_numbers, row_name
-from .rollout import episode_rows, roll_out, scene_seeds
+from .rollout import episode_rows, failures_first, roll_out, scene_seeds
 from .statistics import shared_interval, summarize, summarize_seeds
 
 UNITS = {"DR": "%", "PE": "mm", "SR": "%"}
@@ -74,7 +73,7 @@ def write_report(
 
     A dataset of no task has no simulator to act in: see :func:`dynmap_rl.evaluation.write_held_out`.
     """
-    from .figures import plot_dynamics, plot_reconstruction, save_gif
+    from .figures import plot_dynamics, plot_reconstruction
 
     results = [read_json(folder / f"seed_{seed}" / "eval.json") for seed in seeds]
     if frozen and any(r["world_model_sha256"] != frozen for r in results):
@@ -109,13 +108,24 @@ def write_report(
         plot_reconstruction(world_model, episodes[:3], folder / "figures" / "reconstruction.png")
     plot_dynamics(world_model, episodes[0], folder / "figures" / "dynamics.png")
     policy = load_policy(folder / f"seed_{seeds[0]}" / "policy")
-    failed = [row["scene_seed"] for row in test[0] if not row["success"]][:4]
-    some = failed + [scene_seed("validation", i) for i in range(8 - len(failed))]
-    rollouts = roll_out(Actor(world_model, policy, mixed=True), settings.task, some, keep_pixels=True)
-    save_gif(rollouts, folder / "rollouts.gif")
+    film_policy(
+        Actor(world_model, policy, mixed=True),
+        settings.task,
+        results[0]["test"]["rows"],
+        folder / "rollouts.gif",
+    )
     write_html(folder, _title(result), row_text(result), result["command"])
     write_json(folder / "eval.json", result)  # last: it says that all is done
     return result
+
+
+def film_policy(actor: TensorDictModuleBase, task: str, rows: dict, path: Path) -> None:
+    """Some of the episodes whose ``rows`` :func:`evaluate` gave as an animation, failures first."""
+    from .figures import save_gif
+
+    rows = _rows(rows)
+    some = failures_first([row["scene_seed"] for row in rows], [row["success"] for row in rows])
+    save_gif(roll_out(actor, task, some, keep_pixels=True)["pixels"], path)
 
 
 def _localization(results: list[dict]) -> dict[str, float]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
@@ -89,3 +91,11 @@ def episode_rows(episodes: TensorDict, seeds: list[int]) -> list[dict]:
             row["localization_error"] = round(value, 5)
             row["localization_error_away"] = round(value_away, 5)
     return rows
+
+
+def failures_first(seeds: Sequence[int], success: Sequence[bool], count: int = 8) -> list[int]:
+    """``count`` of the scene seeds to look at: failures, then successes, half of each where there are as many."""
+    pairs = list(zip(seeds, success, strict=True))
+    failed, others = ([seed for seed, good in pairs if good == wanted] for wanted in (False, True))
+    failed = failed[: max(count // 2, count - len(others))]
+    return failed + others[: count - len(failed)]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor
 
+from dynmap_rl.envs.renderer import Renderer
 from dynmap_rl.envs.tasks import BalanceReaching, get_task
 from dynmap_rl.envs.world import EPISODE_STEPS, World
 from dynmap_rl.runs import read_json
@@ -51,24 +53,54 @@ def make_actor(network: ExpertNetwork) -> ProbabilisticActor:
 
 
 @torch.no_grad()
-def roll_out(
+def play(
     network: ExpertNetwork,
     task: BalanceReaching,
     scene_seeds: Sequence[int],
     states: BalanceReaching | None = None,
-) -> list[World]:
-    """Run the mean action on one scene a seed for 120 steps; the worlds are as they are at the end.
+) -> Iterator[list[World]]:
+    """The worlds before each of the 120 steps of the mean action, one world a scene seed; in the end they are as the
+    last step left them.
 
     Args:
         states: the task whose ``state`` the expert was trained on, where it is not ``task``.
     """
     worlds = [task.make_world(task.sample_scene(np.random.default_rng(seed))) for seed in scene_seeds]
     for _ in range(EPISODE_STEPS):
+        yield worlds
         state = np.stack([(states or task).state(world) for world in worlds])
         mean, _ = network(torch.from_numpy(state))
         for world, acceleration in zip(worlds, mean.numpy(), strict=True):
             world.accelerate(acceleration)
+
+
+def roll_out(
+    network: ExpertNetwork,
+    task: BalanceReaching,
+    scene_seeds: Sequence[int],
+    states: BalanceReaching | None = None,
+) -> list[World]:
+    """:func:`play` to the end: the worlds as they are then."""
+    [worlds] = deque(play(network, task, scene_seeds, states), maxlen=1)
     return worlds
+
+
+def film(
+    network: ExpertNetwork,
+    task: BalanceReaching,
+    scene_seeds: Sequence[int],
+    path: Path,
+    states: BalanceReaching | None = None,
+) -> None:
+    """:func:`play` as an animation."""
+    from dynmap_rl.evaluation.figures import save_gif
+
+    renderer = Renderer()
+    steps = play(network, task, scene_seeds, states)
+    frames = np.stack(
+        [[renderer.draw(world, task) for world in worlds] for worlds in steps], 1
+    )  # [E, T, ...]
+    save_gif(torch.from_numpy(frames).permute(0, 1, 4, 2, 3), path)
 
 
 def list_checkpoints(expert: str | Path) -> list[str]:

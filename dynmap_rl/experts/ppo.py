@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 from torchrl.modules import MLP, ValueOperator
@@ -167,35 +167,6 @@ def rates_text(row: dict) -> str:
     error = f"position error {1000 * row['position_error']:.0f} mm"
     rate = f"success {100 * row['success']:.1f} % [{low:.1f}, {high:.1f}]   drop {100 * row['drop']:.1f} %"
     return f"{rate}   {error}   ({row['episodes']} scenes)"
-
-
-@torch.no_grad()
-def play(env: EnvBase, network: ExpertNetwork, seeds: list[int]) -> Iterator[TensorDictBase]:
-    """What is observed in each of the 120 steps of the mean action's episodes, one a scene seed.
-
-    Args:
-        env: ``[len(seeds)]`` worlds with ``state``, controlled by accelerations.
-    """
-    td = env.reset(scene_seed=torch.tensor(seeds))
-    for _ in range(EPISODE_STEPS):
-        yield td
-        td = env.step(td.set("action", network(td["state"])[0]))["next"]
-
-
-def film(env: EnvBase, network: ExpertNetwork, seeds: list[int], path: Path) -> None:
-    """:func:`play` as an animation; the environment also has ``pixels``."""
-    from dynmap_rl.evaluation.figures import save_gif
-
-    frames = [td["pixels"] for td in play(env, network, seeds)]
-    save_gif(TensorDict({"pixels": torch.stack(frames, 1)}, [len(seeds), EPISODE_STEPS]), path)
-
-
-def failures_first(
-    task: BalanceReaching, worlds: Iterable[World], seeds: list[int], count: int = 8
-) -> list[int]:
-    """``count`` of the scene seeds, those first whose worlds ended without success."""
-    success = [task.is_success(world) for world in worlds]
-    return [seed for _, seed in sorted(zip(success, seeds, strict=True))][:count]
 
 
 def fresh_scenes(count: int) -> list[int]:

@@ -4,7 +4,7 @@ import torch
 
 from dynmap_rl.envs.tasks import TASKS, get_task
 from dynmap_rl.envs.world import EPISODE_STEPS
-from dynmap_rl.evaluation import episode_rows, evaluate, roll_out, scene_seeds
+from dynmap_rl.evaluation import episode_rows, evaluate, failures_first, roll_out, scene_seeds
 from dynmap_rl.modules import Actor, make_policy, make_world_model
 
 CONSTANTS = {
@@ -61,3 +61,18 @@ def test_both_protocols_on_their_own_scenes(task):
     test, paper = (set(range(seed, seed + count)) for seed, count in zip(first, counts, strict=True))
     train = set(scene_seeds("train", 100_000)) | set(scene_seeds("eval", 100_000))
     assert not test & paper and not (test | paper) & train
+
+
+@pytest.mark.parametrize(
+    ("failed", "shown"),
+    [
+        ([], [0, 1, 2, 3]),
+        ([5], [5, 0, 1, 2]),
+        ([3, 4, 7], [3, 4, 0, 1]),
+        ([0, 1, 2, 3, 4, 5, 7], [0, 1, 2, 6]),
+        (range(8), [0, 1, 2, 3]),
+    ],
+)
+def test_half_of_what_is_shown_failed_where_that_many_did(failed, shown):
+    assert failures_first(range(8), [seed not in failed for seed in range(8)], count=4) == shown
+    assert failures_first([0, 1], [True, False], count=4) == [1, 0]

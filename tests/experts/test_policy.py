@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -15,6 +16,7 @@ from dynmap_rl.envs.tasks import TASKS, get_task
 from dynmap_rl.envs.world import ACCELERATION_LIMIT
 from dynmap_rl.experts import (
     ExpertNetwork,
+    film,
     list_checkpoints,
     load_expert,
     make_actor,
@@ -145,3 +147,14 @@ def test_actor_samples_and_gives_the_log_probability():
     assert not torch.equal(td["action"], td["loc"])
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         assert torch.equal(actor(td.select("state"))["action"], td["loc"])
+
+
+def test_a_film_shows_the_environments_frames(tmp_path):
+    seeds, network = [scene_seed("exploration", i) for i in range(2)], load_expert(TASK)
+    film(network, get_task(TASK), seeds, tmp_path / "film.gif")
+    env = DynmapBatchedEnv(TASK, num_envs=2, from_pixels=True)
+    first = env.reset(TensorDict({"scene_seed": torch.tensor(seeds)}, [2]))["pixels"]
+    first = torch.cat([*first.permute(0, 2, 3, 1)], 1).numpy().astype(int)
+    with Image.open(tmp_path / "film.gif") as picture:
+        shown = np.asarray(picture.convert("RGB").resize((256, 64), Image.Resampling.NEAREST)).astype(int)
+    assert abs(shown[:, :128] - first).mean() < 5, "a GIF has 256 colours"

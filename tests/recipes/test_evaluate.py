@@ -19,11 +19,13 @@ def test_task_1s_expert_meets_the_obstacle_of_task_2(tmp_path):
     result = run(tmp_path, "evaluate", *arguments, "--split", "validation")
     assert result.returncode == 0, result.stderr
     name = f"balance_reaching_obstacle_balance_reaching_{list_checkpoints('balance_reaching')[-1]}_validation"
-    rates = read_json(tmp_path / f"runs/evaluate/{name}.json")["rates"]
+    rates = read_json(tmp_path / f"runs/evaluate/{name}/eval.json")["rates"]
     assert 20 < rates["straight_path_blocked"] < 80
     assert rates["touched"] > 20
     assert rates["success"] + rates["touched"] <= 100
     assert f"{rates['touched']:5.1f} %" in result.stdout
+    page = (tmp_path / "runs/evaluate" / name / "report.html").read_text()
+    assert f"{rates['touched']:5.1f} %" in page and "data:image/gif" in page and "validation" in page
 
     folder, output = str(CHECKPOINTS / "balance_reaching"), tmp_path / "by_folder.json"
     task = "balance_reaching_obstacle"
@@ -47,10 +49,12 @@ def test_a_run_and_its_copy_for_lerobot_get_the_same_row(trained, tmp_path):
     common = "--episodes", "3", "--split", "validation"
     result = run(tmp_path, "evaluate", "--policy", "trained", "--seed", "1", *common)
     assert result.returncode == 0, result.stderr
-    ours = read_json(tmp_path / "runs/evaluate/bin_dropping_trained_seed_1_validation.json")
+    ours = read_json(tmp_path / "runs/evaluate/bin_dropping_trained_seed_1_validation/eval.json")
     assert ours["rows"]["first_scene_seed"] == scene_seed("validation", 0)
     summary = ours["summary"]  # an untrained policy may well tip the block into the bin
-    assert f"PE {summary['PE']:.1f} mm   SR {summary['SR']:.1f} %" in result.stdout
+    row = f"PE {summary['PE']:.1f} mm   SR {summary['SR']:.1f} %"
+    page = (tmp_path / "runs/evaluate/bin_dropping_trained_seed_1_validation/report.html").read_text()
+    assert row in result.stdout and row in page and "data:image/gif" in page
 
     lerobot = pytest.importorskip("dynmap_rl.integrations.lerobot")
     exported = lerobot.export_to_lerobot(trained, tmp_path / "exported", seed=1)
@@ -64,7 +68,7 @@ def test_a_run_and_its_copy_for_lerobot_get_the_same_row(trained, tmp_path):
 def test_the_shipped_policy_does_as_well_as_its_results_say(tmp_path):
     result = run(tmp_path, "evaluate", "--policy", "balance_reaching", "--episodes", "20")
     assert result.returncode == 0, result.stderr
-    ours = read_json(tmp_path / "runs/evaluate/balance_reaching_balance_reaching_seed_0_test.json")
+    ours = read_json(tmp_path / "runs/evaluate/balance_reaching_balance_reaching_seed_0_test/eval.json")
     facts = read_json(Path(__file__).parents[2] / "recipes/results/pretrained_balance_reaching.json")
     assert ours["rows"]["success"] == facts["rows"]["success"][:20]
 

@@ -33,6 +33,8 @@ def test_writes_errors_and_probes_of_every_world_model(trained, recording, tmp_p
     assert "RGB+[P], decoupled: after 0.2 s without frames the cart is" in result.stdout
     for name in ("open_loop", "probes"):
         assert (tmp_path / f"runs/probe/{name}.png").stat().st_size > 10_000
+    page = (tmp_path / "runs/probe/report.html").read_text()
+    assert page.count("data:image/png") == 2 and "after 0.2 s without frames the cart is" in page
 
 
 def test_a_linear_map_tells_what_is_linear_and_nothing_of_what_is_independent(recording, monkeypatch):
