@@ -30,7 +30,8 @@ class ImaginationEnv(ModelBasedEnvBase):
     ``hidden2``, ``cell2``; ``("predicted_dynamics", quantity)`` (SI units) for what the world model decodes;
     ``("reconstruction", "pixels")`` float32 in 0..1, with ``decode_pixels``; and what else ``start`` holds, such as
     ``goal``, which stays as it is. Nothing is predicted for the first frame of an episode: where that is the start,
-    its dynamics and frame are decoded from zeros.
+    its dynamics and frame are decoded from zeros. Under other names, nested ones too, by TorchRL's ``RenameTransform``
+    (what is also read, such as ``latent``, in both directions).
 
     The world model predicts no task reward and no end of an episode: ``reward`` is what the function given for it
     makes of the observations, 0 without one, and ``done`` is never true. Give ``env.rollout`` a number of steps.

@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
-from torchrl.envs import Compose, InitTracker, TransformedEnv
+from torchrl.envs import Compose, InitTracker, RenameTransform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from dynmap_rl.data import load_dataset
@@ -205,3 +205,17 @@ def test_open_loop_errors_on_demonstrations(recording):
         open_loop_errors(make_model(()), episodes)
     with pytest.raises(ValueError, match=r"100 \+ 40 steps do not fit into episodes of 120"):
         open_loop_errors(make_model(), episodes, context=100)
+
+
+@torch.no_grad()
+def test_other_names_by_torchrl_s_own_transform(frames):
+    model = make_model()
+    env = ImaginationEnv(model, make_start(model, frames))
+    names = ["latent", "hidden1", "hidden2"]
+    nested, move = [("world", name) for name in names], ("agent", "move")
+    renamed = TransformedEnv(env, RenameTransform(names, nested, ["action", *names], [move, *nested]))
+    check_env_specs(renamed)
+    theirs = renamed.rollout(5, lambda td: td.set(move, 0.01 * torch.tanh(td["world", "latent"][:, :3])))
+    ours = env.rollout(5, lambda td: td.set("action", 0.01 * torch.tanh(td["latent"][:, :3])))
+    for name, key in zip(names, nested, strict=True):
+        assert torch.equal(theirs["next", *key], ours["next", name])
