@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import random
 import signal
@@ -29,7 +30,7 @@ SMALL = "--num_envs 4 --iterations 12 --epochs 1 --minibatch 240 --checkpoint_ev
 COMMANDS = {
     "collect": "--episodes 60 --eval_episodes 10",
     "expert": SMALL,
-    "decoupled": "--smoke --seeds 0,1",
+    "decoupled": "--smoke --seeds 0,1 --updates 1100",  # saved every 250
     "tables": "--smoke --only joint_none --results results",
 }
 LEFT_OUT = {"seconds", "command"}  # wall-clock time
@@ -110,7 +111,7 @@ def torment(recipe: str, kills: int, folder: Path) -> None:
     began = time.perf_counter()
     run(recipe, whole)
     duration = time.perf_counter() - began
-    expected, count, runs = contents(whole), 0, 0
+    expected, ends, count, midway, runs = contents(whole), finished(whole), 0, 0, 0
     while count < kills:
         killed, runs = folder / f"{recipe}_killed_{runs}", runs + 1
         killed.mkdir()
@@ -121,11 +122,13 @@ def torment(recipe: str, kills: int, folder: Path) -> None:
             if again := lost(kept, killed):
                 raise SystemExit(f"{recipe}: after {count} kills these were made again: {', '.join(again)}")
             kept = finished(killed)
+            midway += any(name.endswith(".pt") and kept[name] < ends.get(name, math.inf) for name in kept)
         found = contents(killed)
         differing = sorted(name for name in {*expected, *found} if expected.get(name) != found.get(name))
         if differing:
             raise SystemExit(f"{recipe}: after {count} kills these differ: {', '.join(differing)}")
-    print(f"{recipe}: {count} kills of {runs} runs, {len(expected)} files the same", flush=True)
+    kills = f"{count} kills of {runs} runs, {midway} of them after a training was saved and before it ended"
+    print(f"{recipe}: {kills}; {len(expected)} files the same", flush=True)
 
 
 def main() -> None:

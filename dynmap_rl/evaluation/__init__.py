@@ -6,7 +6,7 @@ from .imagination import open_loop_errors
 from .paper import TABLES, paper_numbers, parse_supervision, row_name
 from .report import SHARED_STARTS, evaluate, film_policy, print_row, write_report
 from .rollout import episode_rows, failures_first, roll_out, scene_seeds
-from .statistics import shared_interval, success_gap, summarize, summarize_seeds, wilson
+from .statistics import rate_gap, shared_interval, summarize, summarize_seeds, wilson
 
 __all__ = [
     "SHARED_STARTS",
@@ -24,7 +24,7 @@ __all__ = [
     "row_name",
     "scene_seeds",
     "shared_interval",
-    "success_gap",
+    "rate_gap",
     "summarize",
     "summarize_seeds",
     "wilson",

@@ -6,14 +6,18 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import false_discovery_control
 
 from .report import result_rows
-from .statistics import success_gap
+from .statistics import rate_gap
 from .tables import ROWS, read_cells
 
 ONE, TWO, THREE = "balance_reaching", "balance_reaching_obstacle", "bin_dropping"
 DYNAMICS_ROWS = [row for row in ROWS if row.startswith("RGB+")]
 SEEDED = "Only-RGB", "RGB+[P]", "RGB+[V]", "RGB+[P+V]", "RGB+[P+V+A]"  # the rows that carry the claims
+
+DROPS = "Recurrent policies drop the block less often than feed-forward ones"
+END_TO_END = "World models beat End-to-End"
 
 Key = tuple[str, str, str, str]  # task, training, policy, row
 
@@ -24,6 +28,8 @@ def list_pairs() -> Iterator[tuple[str, str, Key, Key]]:
         ("task 1, feed-forward", (ONE, "decoupled", "feedforward")),
         ("task 1, recurrent", (ONE, "decoupled", "recurrent")),
         ("task 1, joint", (ONE, "joint", "recurrent")),
+        ("task 2, joint", (TWO, "joint", "recurrent")),
+        ("task 3, joint", (THREE, "joint", "recurrent")),
     ]
     for name, column in columns:
         for row in DYNAMICS_ROWS:
@@ -36,10 +42,15 @@ def list_pairs() -> Iterator[tuple[str, str, Key, Key]]:
     for row in ["Only-RGB", *DYNAMICS_ROWS]:
         pair = (ONE, "decoupled", "recurrent", row), (*feedforward, row)
         yield "Recurrent policies beat feed-forward ones", row, *pair
+        yield DROPS, row, *pair
     for number, task in enumerate((ONE, TWO, THREE), start=1):
         for row in ["Only-RGB", *DYNAMICS_ROWS]:
             pair = (task, "decoupled", "recurrent", row), (task, "joint", "recurrent", row)
             yield "Decoupled training beats joint training", f"task {number}: {row}", *pair
+    for number, task in enumerate((ONE, TWO, THREE), start=1):
+        for training in ("decoupled", "joint"):
+            pair = (task, training, "recurrent", "Only-RGB"), (task, "joint", "recurrent", "End-to-End")
+            yield END_TO_END, f"task {number}: Only-RGB, {training} - End-to-End", *pair
     for claim, task in (("Transfer holds on task 2", TWO), ("Transfer fails on task 3", THREE)):
         for row in DYNAMICS_ROWS:
             pair = (task, "decoupled", "recurrent", row), (task, "decoupled", "recurrent", "Only-RGB")
@@ -47,14 +58,29 @@ def list_pairs() -> Iterator[tuple[str, str, Key, Key]]:
 
 
 def compare_cells(results: Path) -> list[dict]:
-    """A dict for every pair of which both cells are there: ``claim``, ``comparison``, ``SR`` of both (%), ``gap`` in
-    points with its 95 % bootstrap ``interval`` over the start states, and ``p`` of a paired permutation test."""
+    """A dict for every pair of which both cells are there: ``claim``, ``comparison``, ``rates`` of both (SR, of ``DROPS``
+    DR, %), ``gap`` in points with its 95 % bootstrap ``interval`` over the start states, ``p`` of a paired permutation
+    test, adjusted for all the comparisons made (Benjamini and Hochberg), and ``apart``: whether every policy of one
+    has a higher rate than every policy of the other."""
     cells, rows = read_cells(results), []
     for claim, comparison, a, b in list_pairs():
         if a in cells and b in cells:
-            gap = success_gap(result_rows(cells[a]), result_rows(cells[b]))
-            rates = [cells[key]["test_protocol"]["SR"] for key in (a, b)]
-            rows.append({"claim": claim, "comparison": comparison, "SR": rates, **gap})
+            name, outcome = ("DR", "dropped") if claim == DROPS else ("SR", "success")
+            both = [result_rows(cells[key]) for key in (a, b)]
+            each_a, each_b = (
+                [np.mean([row[outcome] for row in seed]) for seed in rows_of] for rows_of in both
+            )
+            rows.append(
+                {
+                    "claim": claim,
+                    "comparison": comparison,
+                    "rates": [cells[key]["test_protocol"][name] for key in (a, b)],
+                    **rate_gap(*both, outcome),
+                    "apart": bool(min(each_a) > max(each_b) or max(each_a) < min(each_b)),
+                }
+            )
+    for row, p in zip(rows, false_discovery_control([row["p"] for row in rows]) if rows else [], strict=True):
+        row["p"] = float(p)
     return rows
 
 
@@ -72,22 +98,32 @@ def spread(results: Path) -> list[dict]:
 
 
 def markdown_findings(results: Path) -> str:
-    """A table of the pairs under each claim, and the spread over world-model seeds."""
+    """A table of the pairs under each claim."""
     parts, rows = [], compare_cells(results)
     for claim in dict.fromkeys(row["claim"] for row in rows):
-        lines = [f"**{claim}**", "", "| | SR | gap, points | p |", "|---|---|---|---|"]
+        name = "DR" if claim == DROPS else "SR"
+        lines = [
+            f"**{claim}**",
+            "",
+            f"| | {name} | gap, points | p | policies apart |",
+            "|---|---|---|---|---|",
+        ]
         for row in rows:
             if row["claim"] == claim:
-                rates = " - ".join(f"{rate:.1f}" for rate in row["SR"])
+                rates = " - ".join(f"{rate:.1f}" for rate in row["rates"])
                 low, high = row["interval"]
                 gap = f"{row['gap']:+.1f} [{low:.1f}, {high:.1f}]"
                 p = f"{row['p']:.3f}" if row["p"] >= 0.001 else "< 0.001"
-                lines.append(f"| {row['comparison']} | {rates} | {gap} | {p} |")
-        parts.append("\n".join(lines))
-    if seeded := spread(results):
-        lines = ["| world models of several seeds | SR of each | mean (std) |", "|---|---|---|"]
-        for row in seeded:
-            rates = ", ".join(f"{rate:.1f}" for rate in row["SR"])
-            lines.append(f"| {row['row']} | {rates} | {row['mean']:.1f} ({row['std']:.1f}) |")
+                apart = "yes" if row["apart"] else "no"
+                lines.append(f"| {row['comparison']} | {rates} | {gap} | {p} | {apart} |")
         parts.append("\n".join(lines))
     return "\n\n".join(parts)
+
+
+def markdown_spread(results: Path) -> str:
+    """The same of :func:`spread`."""
+    lines = ["| world models of several seeds | SR of each | mean (std) |", "|---|---|---|"]
+    for row in spread(results):
+        rates = ", ".join(f"{rate:.1f}" for rate in row["SR"])
+        lines.append(f"| {row['row']} | {rates} | {row['mean']:.1f} ({row['std']:.1f}) |")
+    return "\n".join(lines)

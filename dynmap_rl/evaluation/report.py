@@ -161,13 +161,15 @@ def row_text(result: dict) -> str:
 
 
 def markdown_row(result: dict) -> str:
-    """A row of the README's tables: the paper's numbers, ours by its protocol, ours on the shared start states."""
+    """A row of the README's tables: the paper's numbers, ours by its protocol, ours on the shared start states, and there
+    the SR of each policy."""
     test, paper = result["test_protocol"], paper_numbers(result)
     low, high = shared_interval(result_rows(result))
     others = [f"{test[name]:.1f}" for name in _metrics(result) if name != "SR"]
     ours = _short({name: result["paper_protocol"][name] for name in _metrics(result)})
     rate = f"**{test['SR']:.1f}** [{low:.1f}, {high:.1f}]"
-    return f"| {' | '.join([result['row'], _short(paper) if paper else '-', ours, *others, rate])} |"
+    each = ", ".join(f"{100 * np.mean([row['success'] for row in rows]):.1f}" for rows in result_rows(result))
+    return f"| {' | '.join([result['row'], _short(paper) if paper else '-', ours, *others, rate, each])} |"
 
 
 def _title(result: dict) -> str:

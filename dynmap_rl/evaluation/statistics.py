@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import bootstrap, norm, permutation_test
+from scipy.stats import binom, bootstrap, norm
 
 
 def summarize(rows: list[dict]) -> dict[str, float]:
@@ -60,11 +60,12 @@ def shared_interval(rows_by_seed: list[list[dict]], outcome: str = "success") ->
     return wilson(float(rate * count), float(count))
 
 
-def success_gap(rows_a: list[list[dict]], rows_b: list[list[dict]]) -> dict:
-    """SR of a less SR of b, in points, on start states that both share.
+def rate_gap(rows_a: list[list[dict]], rows_b: list[list[dict]], outcome: str = "success") -> dict:
+    """A rate of a less that of b, in points, on start states that both share.
 
     Args:
         rows_a, rows_b: per policy seed, the rows of the same scenes in the same order.
+        outcome: what is counted.
 
     Returns:
         ``gap``, its 95 % bootstrap ``interval`` over the start states, after averaging over policy seeds, and ``p``, the
@@ -78,22 +79,27 @@ def success_gap(rows_a: list[list[dict]], rows_b: list[list[dict]]) -> dict:
         raise ValueError("the two results are not on the same start states; evaluate both again")
 
     def count(rows, weight):  # whole numbers, so that a tie is one
-        return weight * np.sum([[row["success"] for row in seed] for seed in rows], axis=0)
+        return weight * np.sum([[row[outcome] for row in seed] for seed in rows], axis=0)
 
-    a, b = count(rows_a, len(rows_b)), count(rows_b, len(rows_a))
-    difference = 100 * (a - b) / (len(rows_a) * len(rows_b))
+    counts = count(rows_a, len(rows_b)) - count(rows_b, len(rows_a))
+    difference = 100 * counts / (len(rows_a) * len(rows_b))
     gap = float(difference.mean())
     interval = gap, gap  # where there is nothing to choose from
     if np.ptp(difference):
         found = bootstrap((difference,), np.mean, rng=np.random.default_rng(0)).confidence_interval
         interval = float(found.low), float(found.high)
-    if len(difference) < 2 or not difference.any():  # one start state can go either way
-        return {"gap": gap, "interval": interval, "p": 1.0}
-    test = permutation_test(
-        (a, b), _difference, permutation_type="samples", batch=500, rng=np.random.default_rng(0)
-    )
-    return {"gap": gap, "interval": interval, "p": float(test.pvalue)}
+    return {"gap": gap, "interval": interval, "p": exchange_p(counts)}
 
 
-def _difference(a: np.ndarray, b: np.ndarray, axis: int) -> np.ndarray:
-    return (a - b).sum(axis)
+def exchange_p(differences: np.ndarray) -> float:
+    """The two-sided p of whole numbers' sum, if every sign were drawn at random: exact, where SciPy's permutation test
+    draws a sample, and in a thousandth of its time."""
+    sizes, counts = np.unique(np.abs(differences[differences != 0]), return_counts=True)
+    unit = max(np.gcd.reduce(sizes, initial=0), 1)
+    chances = np.ones(1)  # of the sums, in steps of the unit
+    for size, count in zip(sizes // unit, counts, strict=True):
+        of_size = np.zeros(2 * size * count + 1)
+        of_size[:: 2 * size] = binom.pmf(np.arange(count + 1), count, 0.5)
+        chances = np.convolve(chances, of_size)
+    sums = unit * (np.arange(len(chances)) - len(chances) // 2)
+    return min(float(chances[np.abs(sums) >= abs(differences.sum())].sum()), 1.0)

@@ -9,7 +9,7 @@ from dynmap_rl.runs import read_json
 
 from .paper import METRICS, TABLES, paper_numbers
 from .report import markdown_row, result_rows
-from .statistics import shared_interval
+from .statistics import shared_interval, summarize
 
 COLUMNS = {  # table: its columns, as (task, training, policy)
     "I": [key for key in TABLES if key[0] == "balance_reaching"],
@@ -38,7 +38,7 @@ def read_cells(results: Path, world_model_seed: int = 0) -> dict[tuple, dict]:
 
 def table_rows(results: Path) -> list[dict]:
     """A dict for every cell: ``table``, ``row``, ``column``, by our protocol ``DR`` (%), ``PE`` (mm), ``SR`` (%), ``n``
-    episodes and the 95 % ``interval`` of SR; by the paper's ``protocol`` of 50 the mean and standard deviation of each;
+    episodes, the 95 % ``interval`` of SR and SR of each of the ``policies``; by the paper's ``protocol`` of 50 the mean and standard deviation of each;
     the ``paper``'s own; ``seeds`` and ``command``."""
     cells, rows = read_cells(results), []
     for table, columns in COLUMNS.items():
@@ -54,6 +54,7 @@ def table_rows(results: Path) -> list[dict]:
                             **{name: test[name] for name in ("DR", "PE", "SR")},
                             "n": test["episodes"],
                             "interval": shared_interval(result_rows(result)),
+                            "policies": [summarize(rows)["SR"] for rows in result_rows(result)],
                             "protocol": result["paper_protocol"],
                             "paper": paper_numbers(result),
                             "seeds": result["seeds"],
@@ -86,7 +87,14 @@ def markdown_table(results: Path, column: tuple[str, str, str]) -> str:
     1,000 shared starts."""
     cells, metrics = read_cells(results), [name for name in METRICS[column[0]] if name != "SR"]
     what = "SR (std)" + (f"; {', '.join(metrics)}" if metrics else "")
-    head = ["", f"paper: {what}", f"here, paper's protocol: {what}", *metrics, "SR, same 1,000 starts"]
+    head = [
+        "",
+        f"paper: {what}",
+        f"here, paper's protocol: {what}",
+        *metrics,
+        "SR, same 1,000 starts",
+        "each policy",
+    ]
     found = [cells[*column, row] for row in ROWS if (*column, row) in cells]
     lines = [f"| {' | '.join(line)} |" for line in (head, ["---"] * len(head))]
     return "\n".join([*lines, *map(markdown_row, found)])
@@ -103,12 +111,12 @@ def markdown_tables(results: Path) -> str:
 
 def print_tables(results: Path, form: str) -> None:
     """Print all three as ``markdown`` or ``json``, or the ``findings``; ``ValueError`` for another form."""
-    from .findings import markdown_findings
+    from .findings import markdown_findings, markdown_spread
 
     if form == "json":
         print(json.dumps(table_rows(results), indent=1))
     elif form == "findings":
-        print(markdown_findings(results))
+        print(f"{markdown_findings(results)}\n\n{markdown_spread(results)}")
     elif form == "markdown":
         print(markdown_tables(results))
     else:

@@ -21,8 +21,8 @@ from dynmap_rl.runs import write_json
 RESULTS = Path(__file__).parents[2] / "recipes" / "results"
 COMMANDS = {
     "robovet": ["doctor", "DATASET"],
-    "rdq": ["check", "DATASET"],
-    "lerobot-doctor": ["check", "DATASET"],
+    "rdq": ["check", "DATASET", "--fail-under", "100"],
+    "lerobot-doctor": ["check", "DATASET", "--ci", "--fail-on", "fail"],
 }
 SAID = re.compile(r"\d+ (?:fail|pass)|Score|WARN|ERROR|FAIL|^\s*- |CLEAN", re.I)
 

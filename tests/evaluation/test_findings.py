@@ -4,7 +4,14 @@ import json
 
 import pytest
 
-from dynmap_rl.evaluation.findings import compare_cells, list_pairs, markdown_findings, spread
+from dynmap_rl.evaluation.findings import (
+    DROPS,
+    compare_cells,
+    list_pairs,
+    markdown_findings,
+    markdown_spread,
+    spread,
+)
 from dynmap_rl.evaluation.paper import TABLES
 
 TASK = "balance_reaching"
@@ -25,7 +32,7 @@ def write(folder, row, successes, policy="recurrent", training="decoupled", task
         "task": task,
         "world_model": {"task": TASK, "training": training},
         "settings": {"world_model_seed": seed},
-        "test_protocol": {"SR": 100 * successes / count},
+        "test_protocol": {"SR": 100 * successes / count, "DR": 0.0},
         "results": [{"test": {"rows": rows}}] * 3,
     }
     (folder / f"{task}_{training}_{row}_{policy}_{seed}.json").write_text(json.dumps(result))
@@ -47,11 +54,12 @@ def test_cells_that_are_there_are_compared_on_their_start_states(tmp_path):
     assert set(found) == {
         ("Dynamics beat Only-RGB", "task 1, recurrent: RGB+[V] - Only-RGB"),
         ("Recurrent policies beat feed-forward ones", "RGB+[V]"),
+        (DROPS, "RGB+[V]"),
     }
     better = found["Dynamics beat Only-RGB", "task 1, recurrent: RGB+[V] - Only-RGB"]
-    assert better["SR"] == [95.0, 50.0]
+    assert better["rates"] == [95.0, 50.0]
     assert better["gap"] == pytest.approx(45.0)
-    assert better["interval"][0] > 20 and better["p"] < 0.001
+    assert better["interval"][0] > 20 and better["p"] < 0.001 and better["apart"]
     text = markdown_findings(tmp_path)
     assert "| task 1, recurrent: RGB+[V] - Only-RGB | 95.0 - 50.0 | +45.0 [" in text
     assert "**Decoupled training beats joint training**" not in text
@@ -61,8 +69,31 @@ def test_spread_is_over_the_seeds_of_the_world_model(tmp_path):
     for seed, successes in enumerate((20, 30, 40)):
         write(tmp_path, "Only-RGB", successes, seed=seed)
     write(tmp_path, "RGB+[P]", 40)
-    assert compare_cells(tmp_path)[0]["SR"] == [100.0, 50.0]  # of the first seed
+    assert compare_cells(tmp_path)[0]["rates"] == [100.0, 50.0]  # of the first seed
     [row] = spread(tmp_path)
     assert (row["row"], row["SR"], row["mean"]) == ("Only-RGB", [50.0, 75.0, 100.0], 75.0)
     assert row["std"] == pytest.approx(20.4, abs=0.1)
-    assert "| Only-RGB | 50.0, 75.0, 100.0 | 75.0 (20.4) |" in markdown_findings(tmp_path)
+    assert "| Only-RGB | 50.0, 75.0, 100.0 | 75.0 (20.4) |" in markdown_spread(tmp_path)
+
+
+def test_p_is_adjusted_and_policies_are_apart(tmp_path):
+    write(tmp_path, "Only-RGB", 20)
+    write(tmp_path, "RGB+[P]", 25)
+    alone = compare_cells(tmp_path)[0]
+    assert alone["p"] == pytest.approx(2 / 2**5) and alone["apart"]
+    write(tmp_path, "RGB+[V]", 20)
+    both = {row["comparison"]: row for row in compare_cells(tmp_path)}
+    assert both["task 1, recurrent: RGB+[P] - Only-RGB"]["p"] == pytest.approx(2 * 2 / 2**5)
+    assert not both["task 1, recurrent: RGB+[V] - Only-RGB"]["apart"]
+
+
+def test_drops_are_compared_as_drops(tmp_path):
+    for policy, dropped in (("recurrent", "0" * 40), ("feedforward", "1" * 10 + "0" * 30)):
+        write(tmp_path, "Only-RGB", 20, policy=policy)
+        path = tmp_path / f"{TASK}_decoupled_Only-RGB_{policy}_0.json"
+        result = json.loads(path.read_text())
+        for seed in result["results"]:
+            seed["test"]["rows"]["dropped"] = dropped
+        path.write_text(json.dumps(result))
+    [row] = [row for row in compare_cells(tmp_path) if row["claim"] == DROPS]
+    assert row["gap"] == pytest.approx(-25.0)

@@ -1,19 +1,15 @@
 """The report page: whole, well-formed, and without anything from elsewhere."""
 
-import json
-import subprocess
-import sys
 from html.parser import HTMLParser
-from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import open_in_browser
 from PIL import Image
 
 from dynmap_rl.evaluation import write_html
 from dynmap_rl.runs import append_metrics, write_json
 
-BROWSER = Path(__file__).parents[1] / "browser.py"
 VOID = {"meta", "img", "br", "hr", "link"}
 
 
@@ -74,16 +70,6 @@ def test_the_same_run_gives_the_same_page(folder):
 def test_a_run_without_results_has_a_page_too(tmp_path):
     write_json(tmp_path / "config.json", {"seed": 0})
     assert "seed" in Page(write_html(tmp_path, "title", "row").read_text()).text
-
-
-def open_in_browser(page, picture):
-    result = subprocess.run(
-        [sys.executable, BROWSER, page, picture], capture_output=True, text=True, timeout=200
-    )
-    if "ModuleNotFoundError" in result.stderr or "cannot open shared object file" in result.stderr:
-        pytest.skip(f"pip install '.[browser]', and what it needs: {result.stderr.splitlines()[-1]}")
-    assert result.returncode == 0, result.stderr
-    return json.loads(result.stdout)
 
 
 def test_a_browser_shows_the_whole_page_and_asks_for_nothing_else(folder, tmp_path):

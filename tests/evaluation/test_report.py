@@ -1,12 +1,14 @@
 """Our rows beside the paper's, and what a report refuses."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from dynmap_rl.envs.tasks import TASKS
-from dynmap_rl.evaluation import paper_numbers, write_report
-from dynmap_rl.runs import write_json
+from dynmap_rl.evaluation import paper_numbers, shared_interval, write_report
+from dynmap_rl.evaluation.report import result_rows
+from dynmap_rl.runs import read_json, write_json
 
 
 def row(task, training, policy, name, trained_on="balance_reaching") -> dict:
@@ -71,3 +73,15 @@ def test_seeds_on_different_world_models_are_no_row(tmp_path, recording):
         write_json(tmp_path / f"seed_{seed}" / "eval.json", {"world_model_sha256": fingerprint})
     with pytest.raises(ValueError, match="belong to another world model"):
         write_report(tmp_path, SimpleNamespace(), recording, None, None, seeds=[0, 1], frozen="one")
+
+
+def test_intervals_kept_in_the_results_are_those_of_their_episodes():
+    files = [
+        read_json(path) for path in (Path(__file__).parents[2] / "recipes/results").glob("*_recurrent*.json")
+    ]
+    results = [result for result in files if "results" in result]
+    assert len(results) > 50
+    for result in results:
+        for name, outcome in (("SR_interval", "success"), ("DR_interval", "dropped")):
+            kept, found = result["test_protocol"][name], shared_interval(result_rows(result), outcome)
+            assert kept == pytest.approx(found), result["command"]

@@ -1,15 +1,17 @@
 import numpy as np
 import pytest
+from scipy.stats import permutation_test
 
 from dynmap_rl.evaluation import (
     parse_supervision,
+    rate_gap,
     row_name,
     shared_interval,
-    success_gap,
     summarize,
     summarize_seeds,
     wilson,
 )
+from dynmap_rl.evaluation.statistics import exchange_p
 
 
 def rows(successes, dropped=0, count=10, error=0.02):
@@ -58,10 +60,10 @@ def test_paper_s_protocol_is_mean_and_standard_deviation_over_seeds():
 
 
 def test_gap_is_paired_and_has_an_interval():
-    result = success_gap([rows(80, count=100)], [rows(60, count=100)])
+    result = rate_gap([rows(80, count=100)], [rows(60, count=100)])
     assert result["gap"] == pytest.approx(20.0)
     assert result["interval"][0] < 20 < result["interval"][1]
-    same = success_gap([rows(5)], [rows(5)])
+    same = rate_gap([rows(5)], [rows(5)])
     assert same == {"gap": 0.0, "interval": (0.0, 0.0), "p": 1.0}
 
 
@@ -69,14 +71,14 @@ def test_p_is_that_of_a_sign_test_where_each_start_state_has_one_outcome():
     """5 starts that only a solves against 1 that only b solves: 2 * (1 + 6) / 2**6 by hand."""
     a = [dict(row, success=i < 5) for i, row in enumerate(rows(10))]
     b = [dict(row, success=i == 5) for i, row in enumerate(rows(10))]
-    assert success_gap([a], [b])["p"] == pytest.approx(14 / 64)
-    assert success_gap([b], [a])["p"] == pytest.approx(14 / 64)
+    assert rate_gap([a], [b])["p"] == pytest.approx(14 / 64)
+    assert rate_gap([b], [a])["p"] == pytest.approx(14 / 64)
 
 
 @pytest.mark.parametrize(("count", "p"), [(1, 1.0), (3, 0.25), (6, 1 / 32)])
 def test_p_where_all_start_states_agree(count, p):
     """a always succeeds, b never: 2 / 2**count by hand."""
-    result = success_gap([rows(count, count=count)], [rows(0, count=count)])
+    result = rate_gap([rows(count, count=count)], [rows(0, count=count)])
     assert result == {"gap": 100.0, "interval": (100.0, 100.0), "p": pytest.approx(p)}
 
 
@@ -84,14 +86,31 @@ def test_p_does_not_depend_on_rounding():
     """One of three policies fails in three starts of 1,000, where the others always succeed: 2 / 2**3 by hand."""
     a = [rows(1000, count=1000), rows(1000, count=1000), rows(997, count=1000)]
     b = [rows(1000, count=1000)] * 3
-    assert success_gap(a, b)["p"] == pytest.approx(0.25, abs=0.02)
-    assert success_gap(b, a[2:])["p"] == pytest.approx(0.25, abs=0.02)
+    assert rate_gap(a, b)["p"] == pytest.approx(0.25)
+    assert rate_gap(b, a[2:])["p"] == pytest.approx(0.25)
+
+
+def test_p_is_that_of_scipy_s_permutation_test():
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        a, b = rng.integers(0, 10, (2, 11))
+        expected = permutation_test(
+            (a, b), lambda x, y, axis: (x - y).sum(axis), permutation_type="samples", n_resamples=np.inf
+        )
+        assert exchange_p(a - b) == pytest.approx(expected.pvalue)
+
+
+def test_gap_of_drops():
+    a, b = rows(10), [dict(row, dropped=i < 3) for i, row in enumerate(rows(10))]
+    assert rate_gap([b], [a], "dropped")["gap"] == pytest.approx(
+        30.0 - 100 * np.mean([r["dropped"] for r in a])
+    )
 
 
 def test_gap_refuses_other_start_states():
     other = [dict(row, scene_seed=row["scene_seed"] + 1) for row in rows(5)]
     with pytest.raises(ValueError, match="start states"):
-        success_gap([rows(5)], [other])
+        rate_gap([rows(5)], [other])
 
 
 def test_row_names_are_the_paper_s():
