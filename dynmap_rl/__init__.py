@@ -33,21 +33,26 @@ def _register(gymnasium) -> None:
 
 
 class _RegisterWithGymnasium:
-    """Finds Gymnasium as Python does, and registers the ids once it is imported, which takes 0.4 s."""
+    """Finds Gymnasium as the finders after it do, and registers the ids once it is imported.
+
+    Gymnasium (1.4) has no entry points by which a package could name its ids, and importing it here would take 0.4 s
+    of every start. An import that fails leaves this in place: the next may succeed.
+    """
 
     @classmethod
     def find_spec(cls, name, path=None, target=None):
         if name != "gymnasium":
             return None
-        others = (finder for finder in sys.meta_path if finder is not cls)
+        others = sys.meta_path[sys.meta_path.index(cls) + 1 :]
         spec = next((spec for finder in others if (spec := finder.find_spec(name, path))), None)
         if spec:
             execute = spec.loader.exec_module
 
             def execute_and_register(module):
-                sys.meta_path.remove(cls)
                 execute(module)
                 _register(module)
+                if cls in sys.meta_path:
+                    sys.meta_path.remove(cls)
 
             spec.loader.exec_module = execute_and_register
         return spec

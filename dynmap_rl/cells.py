@@ -11,7 +11,13 @@ SUPERVISIONS = (
     "velocity,acceleration", "position,velocity,acceleration",
 )  # fmt: skip
 CLAIMS = "none", "position", "velocity", "position,velocity", "position,velocity,acceleration"
-MINUTES = {"decoupled": 14, "reuse": 5, "joint": 27, "end_to_end": 25, "generalize": 8}  # of one of two busy cores
+MINUTES = {
+    "decoupled": 14,
+    "reuse": 5,
+    "joint": 27,
+    "end_to_end": 25,
+    "generalize": 8,
+}  # of one of two busy cores
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,10 @@ import argparse
 import dataclasses
 import difflib
 import errno
+import multiprocessing
 import os
 import re
+import runpy
 import shlex
 import sys
 from collections.abc import Iterable
@@ -51,6 +53,30 @@ def run_recipe(main, config_class) -> None:
             raise
         print(f"error: {message}", file=sys.stderr)
         sys.exit(2)
+
+
+def run_script(script: Path, arguments: list[str], folder: Path, log: Path) -> int:
+    """``python SCRIPT ARGUMENTS`` in a folder, what it prints added to ``log``, in a process of its own; its exit code.
+
+    It ends with this process, even if this is killed.
+    """
+    arguments = str(script), arguments, folder, log
+    process = multiprocessing.get_context("spawn").Process(target=_run_here, args=arguments)
+    process.start()
+    process.join()
+    return process.exitcode
+
+
+def _run_here(script: str, arguments: list[str], folder: Path, log: Path) -> None:
+    from dynmap_rl.runs import start_worker
+
+    start_worker()
+    with open(log, "a") as file:
+        for stream in (sys.stdout, sys.stderr):
+            os.dup2(file.fileno(), stream.fileno())
+    os.chdir(folder)
+    sys.argv = [script, *arguments]
+    runpy.run_path(script, run_name="__main__")
 
 
 def read_arguments(given: list[str], config_class) -> list[str]:

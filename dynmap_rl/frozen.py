@@ -19,6 +19,8 @@ from dynmap_rl.evaluation import evaluate, policy_errors
 from dynmap_rl.modules import Actor, WorldModel
 from dynmap_rl.training import fingerprint, train_policy
 
+TRAININGS = ["decoupled", "joint", "end_to_end"]
+
 
 def load_source(run: str | Path) -> tuple[WorldModel, dict[str, str]]:
     """The world model of a finished run, and where it is from: ``task`` and ``training`` (decoupled or joint).
@@ -33,7 +35,9 @@ def load_source(run: str | Path) -> tuple[WorldModel, dict[str, str]]:
     run = modules.find_run(str(run))
     run = run.parent if run.name == "world_model" else run
     source = runs.read_json(run / "eval.json").get("world_model") if (run / "eval.json").exists() else None
-    if source is None:
+    # The file may be a stranger's, and a folder is named after the training.
+    known = isinstance(source, dict) and source.get("training") in TRAININGS
+    if not known or not isinstance(source.get("task"), str):
         raise ValueError(f"{run} holds no finished run; train a world model with recipes/decoupled.py first")
     return modules.load_world_model(run / "world_model"), source
 

@@ -51,12 +51,45 @@ def write_bytes(path: Path, data: bytes) -> None:
         raise
 
 
-def read_json(path: Path):
-    """Raises ``ValueError`` with the file's name where it is not valid JSON, or not a file of UTF-8."""
+def read_json(path: Path, form=dict):
+    """What a JSON file holds.
+
+    Args:
+        form: that it must have, see :func:`check_form`.
+
+    Raises:
+        ValueError: it is not valid JSON, not a file of UTF-8, or of another form; the message names the file.
+    """
     try:
-        return json.loads(Path(path).read_text())
+        value = json.loads(Path(path).read_text())
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not valid JSON ({error}); delete it or restore it") from error
+    check_form(value, form, str(path))
+    return value
+
+
+def check_form(value, form, where: str) -> None:
+    """Refuse JSON in which something is missing, or is not what it should be.
+
+    Args:
+        form: a type; ``[form]`` for a list of such values; ``{name: form}`` for a dict that has these, and maybe others;
+            ``{str: form}`` for one of any names.
+        where: the value is, for the message.
+
+    Raises:
+        ValueError: the value is of another form.
+    """
+    kind = form if isinstance(form, type) else type(form)
+    if not isinstance(value, kind):
+        text = json.dumps(value)
+        text = text if len(text) < 40 else f"{text[:40]} ..."
+        raise ValueError(f"{where} is {text}, not of the type {kind.__name__}; restore the file or delete it")
+    if isinstance(form, list):
+        for number, entry in enumerate(value):
+            check_form(entry, form[0], f"{where}, {number}")
+    elif isinstance(form, dict):
+        for name in value if str in form else form:
+            check_form(value.get(name), form.get(name, form.get(str)), f"{where}, {name}")
 
 
 def open_run(folder: Path, config, *, ignore: tuple[str, ...] = ()) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from tensordict import TensorDictBase
@@ -108,7 +109,9 @@ def load_episodes(settings, dataset: str | Path) -> tuple[dict[str, TensorDictBa
 
 def name_task(settings) -> str:
     """What a run's folder is named after: the task, or the dataset that is of none."""
-    return Path(settings.dataset).name if settings.task == NO_TASK else get_task(settings.task).name
+    if settings.task == NO_TASK:
+        return os.path.basename(os.path.abspath(settings.dataset))  # never ".."
+    return get_task(settings.task).name
 
 
 def describe_source(settings, training: str) -> dict[str, str]:

@@ -2,6 +2,7 @@
 
     python recipes/play.py --task bin_dropping
     python recipes/play.py --policy balance_reaching    # ships with the package; or a run folder
+    python recipes/play.py --policy balance_reaching --imagine_from 20 --steps 120 --gif play.gif
     python recipes/play.py --record datasets/mine
 
 Arrows or WASD move the cart, Q and E tilt it, a pressed mouse button calls it; TAB changes who drives: you, the expert
@@ -31,6 +32,8 @@ class Config:
     seed: int = 0
     # Expert: the name of the task that it ships for, or a folder of checkpoints; by default the task's own.
     expert: str | None = None
+    # From this step of every episode on the world model goes on without frames, as if I were pressed; with a policy.
+    imagine_from: int | None = None
     # Who drives at first: hand, expert or policy; by default the policy where there is one.
     driver: str | None = None
     # Number of the first scene.
@@ -51,7 +54,7 @@ def main(config: Config) -> None:
     from dynmap_rl.data import push_dataset
     from dynmap_rl.data.human import list_shards, next_scene, open_folder, publish_episodes
     from dynmap_rl.envs.tasks import get_task
-    from dynmap_rl.envs.world import CONTROL_DT
+    from dynmap_rl.envs.world import CONTROL_DT, EPISODE_STEPS
     from dynmap_rl.modules import find_run, load_actor, task_of_run
     from dynmap_rl.play import PlayWindow, Session
 
@@ -61,6 +64,10 @@ def main(config: Config) -> None:
     get_task(task, from_file=not config.task)
     if config.size < 64 or (config.steps is not None and config.steps < 1):
         raise ValueError("--size must be at least 64 and --steps at least 1")
+    if config.imagine_from is not None and not (actor and 1 <= config.imagine_from < EPISODE_STEPS):
+        raise ValueError(
+            f"--imagine_from is a step of 1 to {EPISODE_STEPS - 1}, and needs --policy, whose world model imagines"
+        )
     if config.gif and not config.steps:
         raise ValueError("--gif needs --steps, the number of steps that the film shows")
     if config.push_to_hub and not config.record:
@@ -104,6 +111,7 @@ def play(config: Config, task: str, session, window, frames: list, dt: float) ->
         window.handle()
         was_over = session.over
         if not window.paused:
+            session.imagining |= session.world.steps == config.imagine_from
             session.step()
             step += 1
         picture = window.draw()
@@ -125,13 +133,17 @@ def play(config: Config, task: str, session, window, frames: list, dt: float) ->
 
 
 def save_film(frames: list, path: Path) -> None:
-    """One picture in two, at half size, in real time."""
+    """One picture in two, at half size, in real time, all with the same 128 colours, or they would flicker."""
+    import numpy as np
     from PIL import Image
 
     images = [Image.fromarray(frame) for frame in frames[::2]]
-    images = [image.resize((image.width // 2, image.height // 2)).quantize(64) for image in images]
+    images = [image.resize((image.width // 2, image.height // 2)) for image in images]
+    some = np.concatenate([np.asarray(image) for image in images[:: len(images) // 16 + 1]])
+    colors = Image.fromarray(some).quantize(128)
+    images = [image.quantize(palette=colors, dither=Image.Dither.NONE) for image in images]
     path.parent.mkdir(parents=True, exist_ok=True)
-    images[0].save(path, save_all=True, append_images=images[1:], duration=100, loop=0, optimize=True)
+    images[0].save(path, save_all=True, append_images=images[1:], duration=100, loop=0)
     print(f"written: {path}")
 
 

@@ -2,6 +2,7 @@
 
     python recipes/tables.py --dry_run                  # the cells, what is done, the time that is left
     python recipes/tables.py                            # all of them, one after the other
+    python recipes/tables.py --table II,III             # those of these tables, and the world models that they need
     python recipes/tables.py --only balance_reaching_decoupled_position --workers 2
     python recipes/tables.py --launcher ray             # on a Ray cluster (pip install '.[ray]')
     python recipes/tables.py --print markdown           # or json: the tables from the results alone
@@ -12,16 +13,16 @@ cell needs and whose run is not there is trained first. A killed run loses at mo
 yet; the same command goes on.
 """
 
-import subprocess
-import sys
+import multiprocessing
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 
-from dynmap_rl.cells import Cell, list_cells
-from dynmap_rl.commands import check_at_least_one, refuse, replace_defaults, run_recipe
+from dynmap_rl.cells import TABLES, Cell, list_cells
+from dynmap_rl.commands import check_at_least_one, refuse, replace_defaults, run_recipe, run_script
 
 RECIPES = Path(__file__).parent
 SMOKE = Path("runs/tables_smoke")
@@ -33,6 +34,8 @@ class Config:
     results: Path = RECIPES / "results"
     # Folder of the cells' runs.
     runs: Path = Path("runs/tables")
+    # Only the cells of these of the paper's tables: I, II, III, or several with commas between.
+    table: str = ",".join(TABLES)
     # Only the cell of this name, or those whose name holds it.
     only: str = ""
     # Cells at a time on this machine; each takes two cores if it is alone, otherwise one.
@@ -57,17 +60,16 @@ def run_cell(cell: Cell, config: Config, root: Path) -> str | None:
     from dynmap_rl.runs import read_json, write_json
 
     folder, log = config.runs / cell.name, root / config.runs / f"{cell.name}.log"
-    command = [sys.executable, str(RECIPES / f"{cell.recipe}.py"), *cell.arguments, "--run", str(folder)]
+    arguments = [*cell.arguments, "--run", str(folder)]
     if cell.needs:
-        command += ["--world_model", str(config.runs / cell.needs)]
+        arguments += ["--world_model", str(config.runs / cell.needs)]
     cores = config.cpus if config.launcher == "ray" else 2 if config.workers == 1 else 1
-    command += ["--threads", str(max(1, int(cores)))]
-    command += ["--smoke"] if config.smoke else []
+    arguments += ["--threads", str(max(1, int(cores)))]
+    arguments += ["--smoke"] if config.smoke else []
     log.parent.mkdir(parents=True, exist_ok=True)
-    with open(log, "a") as file:
-        if subprocess.run(command, cwd=root, stdout=file, stderr=file).returncode:
-            said = (log.read_text(errors="replace").splitlines() or ["nothing"])[-1]
-            return f"{cell.name} failed; see {config.runs / cell.name}.log, which ends with: {said}"
+    if run_script(RECIPES / f"{cell.recipe}.py", arguments, root, log):
+        said = (log.read_text(errors="replace").splitlines() or ["nothing"])[-1]
+        return f"{cell.name} failed; see {config.runs / cell.name}.log, which ends with: {said}"
     if not is_done(cell, config, root):
         write_json(root / config.results / f"{cell.name}.json", read_json(root / folder / "eval.json"))
     return None
@@ -82,12 +84,17 @@ def has_run(name: str, config: Config) -> bool:
 
 
 def launch_local(cells: list[Cell], config: Config) -> Iterator[tuple[Cell, str | None]]:
-    """Every cell with its message, in the order in which they end; each is a process of its own."""
-    with ThreadPoolExecutor(config.workers) as pool:
+    """Every cell with its message, in the order in which they end; all processes end with this one."""
+    from dynmap_rl.runs import start_worker
+
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(config.workers, context, start_worker) as pool:
         try:
             running = {pool.submit(run_cell, cell, config, Path.cwd()): cell for cell in cells}
             for future in as_completed(running):
                 yield running[future], future.result()
+        except BrokenProcessPool as error:
+            raise OSError("a process died; the same command goes on") from error
         except BaseException:  # Ctrl-C has reached the cells in flight too; no other begins
             pool.shutdown(cancel_futures=True)
             raise
@@ -131,10 +138,14 @@ def launch(cells: list[Cell], config: Config) -> list[str]:
 
 
 def choose_cells(config: Config) -> tuple[list[Cell], list[Cell], list[Cell]]:
-    """Those that ``only`` names, those of them to be run, and the world models they need whose run is not there."""
-    cells = list_cells()
-    chosen = [cell for cell in cells if cell.name == config.only]
-    chosen = chosen or [cell for cell in cells if config.only in cell.name]
+    """Those that ``table`` and ``only`` name, those of them to be run, and the world models they need whose run is not
+    there."""
+    cells, tables = list_cells(), {table.strip() for table in config.table.split(",")}
+    if not tables <= set(TABLES):
+        raise ValueError(f"--table is I, II or III, or several with commas between, not {config.table!r}")
+    there = [cell for cell in cells if cell.table in tables]
+    chosen = [cell for cell in there if cell.name == config.only]
+    chosen = chosen or [cell for cell in there if config.only in cell.name]
     if not chosen:
         raise ValueError(f"no cell's name holds {config.only!r}; --dry_run lists them")
     todo = [cell for cell in chosen if not is_done(cell, config)]

@@ -1,18 +1,24 @@
-"""Recipes as commands, but in the tests' own process: a process of their own would import everything again."""
+"""Recipes as commands, but in the tests' own process: a process of their own would import everything again. And what a
+browser makes of the pages that they write."""
 
 from __future__ import annotations
 
 import contextlib
 import importlib
 import io
+import json
+import subprocess
 import sys
 from pathlib import Path
 from subprocess import CompletedProcess
 from unittest import mock
 
+import pytest
 import torch
 
 from dynmap_rl.commands import run_recipe
+
+BROWSER = Path(__file__).with_name("browser.py")
 
 
 def run(folder: Path, recipe: str, *arguments: str) -> CompletedProcess:
@@ -42,3 +48,13 @@ def place_recordings(folder: Path, recordings, *tasks: str) -> None:
     (folder / "datasets").mkdir(exist_ok=True)
     for task in tasks:
         (folder / "datasets" / f"{task}_smoke").symlink_to(recordings(task), target_is_directory=True)
+
+
+def open_in_browser(page: Path, picture: Path) -> dict:
+    """What ``browser.py`` says of a page; the test is skipped where there is no browser."""
+    command = [sys.executable, BROWSER, page, picture]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=200)
+    if "ModuleNotFoundError" in result.stderr or "cannot open shared object file" in result.stderr:
+        pytest.skip(f"pip install '.[browser]', and what it needs: {result.stderr.splitlines()[-1]}")
+    assert result.returncode == 0, result.stderr
+    return json.loads(result.stdout)

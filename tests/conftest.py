@@ -2,7 +2,10 @@
 
 import contextlib
 import functools
+import json
 import os
+import subprocess
+import sys
 import zipfile
 from pathlib import Path
 
@@ -32,6 +35,27 @@ def installed(tmp_path_factory):
         with zipfile.ZipFile(wheels / name) as wheel:
             wheel.extractall(site)
     return site
+
+
+@pytest.fixture(scope="session")
+def command(installed):
+    """Run a script with arguments in a folder, on the package as it is installed: its exit code and what it printed."""
+    process = subprocess.Popen(
+        [sys.executable, "-P", str(ROOT / "tests/worker.py")],
+        env=os.environ | {"PYTHONPATH": str(installed)},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert Path(json.loads(process.stdout.readline())).is_relative_to(installed)
+
+    def run(folder, script, *arguments):
+        line = [str(word) for word in (folder, script, *arguments)]
+        print(json.dumps(line), file=process.stdin, flush=True)
+        return subprocess.CompletedProcess(line, *json.loads(process.stdout.readline()))
+
+    yield run
+    process.communicate()
 
 
 @pytest.fixture(scope="session")

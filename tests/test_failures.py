@@ -81,6 +81,17 @@ def another_schema(place):
     path.write_text(json.dumps(info))
 
 
+def no_column(place):
+    """PyArrow would leave it out without a word."""
+    path = data_file(place)
+    pq.write_table(pq.read_table(path).drop_columns(["action"]), path)
+
+
+def other_json(name, value="[]"):
+    """Valid, but not what it should be."""
+    return lambda place: (place / name).write_text(value)
+
+
 def weights_of_another_size(place):
     path = place / RUN / "world_model/weights.safetensors"
     save_file({name: value[..., :1].contiguous() for name, value in load_file(path).items()}, path)
@@ -114,6 +125,19 @@ CASES = [
     (nan_in_the_actions, TRAIN, "numbers in action that are missing or not finite"),
     (lambda p: truncate(p / DATA / "meta/info.json"), TRAIN, "info.json cannot be read"),
     (lambda p: truncate(p / DATA / "meta/dynmap.json"), TRAIN, "dynmap.json cannot be read"),
+    (other_json(f"{DATA}/meta/info.json"), TRAIN, r"info.json is \[\], not of the type dict; restore"),
+    (
+        other_json(f"{DATA}/meta/info.json", '{"codebase_version": "v3.0", "total_frames": 720}'),
+        f"{TRAIN} --task none",
+        "info.json, features is null, not of the type dict",
+    ),
+    (other_json(f"{DATA}/meta/dynmap.json"), TRAIN, r"dynmap.json is \[\], not of the type dict"),
+    (
+        lambda p: change_json(p / DATA / "meta/dynmap.json", episodes=[{"episode_index": "0"}]),
+        TRAIN,
+        'dynmap.json, episodes, 0, episode_index is "0", not of the type int',
+    ),
+    (no_column, TRAIN, r"parquet lacks the columns action; restore it or record"),
     (nothing, f"{TRAIN} --task bin_dropping", "is of balance_reaching, not of bin_dropping"),
     (
         lambda p: change_json(p / DATA / "meta/dynmap.json", kind="exploration"),
@@ -139,6 +163,24 @@ CASES = [
         "arguments.json is not valid JSON",
     ),
     (lambda p: truncate(p / RUN / "config.json"), EVALUATE, "config.json is not valid JSON"),
+    (other_json(f"{RUN}/config.json"), EVALUATE, r"config.json is \[\], not of the type dict"),
+    (other_json(f"{RUN}/config.json", '{"task": 1}'), EVALUATE, "config.json names no task, but 1"),
+    (
+        other_json(f"{RUN}/config.json"),
+        f"decoupled --smoke --dataset {DATA} --run {RUN}",
+        r"config.json is \[\], not of",
+    ),
+    (
+        other_json(f"{RUN}/eval.json"),
+        f"generalize --smoke --task bin_dropping --world_model {RUN}",
+        r"eval.json is \[\], not of",
+    ),
+    (
+        other_json(f"{RUN}/eval.json", '{"world_model": []}'),
+        f"generalize --smoke --task bin_dropping --world_model {RUN}",
+        f"{RUN} holds no finished run",
+    ),
+    (other_json(f"{RUN}/world_model/arguments.json"), EVALUATE, r"arguments.json is \[\], not of"),
     (weights_of_another_size, EVALUATE, "other names or shapes"),
     (
         half_a_run,

@@ -1,6 +1,9 @@
 """Metrics as lines of JSON, and where else a user wants them."""
 
+import contextlib
 import importlib
+import json
+import sqlite3
 import sys
 from unittest import mock
 
@@ -41,9 +44,9 @@ def test_tensorboard_gets_the_same_numbers(tmp_path):
 @pytest.mark.parametrize("name", ["wandb", "trackio"])
 def test_others_get_them_by_torchrls_loggers_with_the_runs_name(tmp_path, monkeypatch, name):
     """TorchRL's own logger, on a stand-in for the package that it imports."""
-    package = mock.MagicMock()
+    package, module = mock.MagicMock(), importlib.import_module(f"torchrl.record.loggers.{name}")
     monkeypatch.setitem(sys.modules, name, package)
-    monkeypatch.setattr(importlib.import_module(f"torchrl.record.loggers.{name}"), f"_has_{name}", True)
+    monkeypatch.setattr(module, f"_has_{name}", True)
     log_metrics(tmp_path, 1, name, loss=0.5)
     log_metrics(tmp_path, 2, name, loss=0.25)
     [opened] = package.init.call_args_list
@@ -62,6 +65,54 @@ def test_others_get_them_by_torchrls_loggers_with_the_runs_name(tmp_path, monkey
         assert [ids[0] == opened.kwargs["id"], ids[1] == ids[0]] == [True, False]
 
 
+def read_wandb(path):
+    """The records of a run that ``wandb sync`` would upload."""
+    from wandb.proto.wandb_internal_pb2 import Record
+    from wandb.sdk.internal.datastore import DataStore
+
+    store, records = DataStore(), []
+    store.open_for_scan(str(path))
+    while data := store.scan_data():
+        records.append(Record.FromString(data))
+    return records
+
+
+def test_weights_and_biases_writes_the_run_without_a_network(tmp_path, monkeypatch):
+    for name, value in (("MODE", "offline"), ("ERROR_REPORTING", "false")):
+        monkeypatch.setenv(f"WANDB_{name}", value)
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    pytest.importorskip("wandb")
+    for step in (1, 2):
+        log_metrics(tmp_path / "run", step, "wandb", loss=0.123 / step)
+    loggers._open("wandb", tmp_path / "run").experiment.finish()
+    run_id = (tmp_path / "run/wandb/id").read_text()
+    [path] = (tmp_path / "run/wandb").glob(f"offline-run-*/run-{run_id}.wandb")
+    records = read_wandb(path)
+    [opened] = [record.run for record in records if record.HasField("run")]
+    assert (opened.project, opened.display_name) == ("dynmap_rl", (tmp_path / "run").as_posix())
+    rows = [
+        {item.key or item.nested_key[0]: json.loads(item.value_json) for item in record.history.item}
+        for record in records
+        if record.HasField("history")
+    ]
+    assert [(row["step"], row["loss"]) for row in rows] == [(1, 0.123), (2, 0.0615)], rows
+
+
+def test_trackio_writes_the_run_on_this_machine(tmp_path, monkeypatch):
+    monkeypatch.setenv("TRACKIO_DIR", str(tmp_path / "trackio"))  # which it reads when it is imported
+    pytest.importorskip("trackio")
+    for step in (1, 2):
+        log_metrics(tmp_path / "run", step, "trackio", loss=1 / step)
+    loggers._open("trackio", tmp_path / "run").experiment.finish()
+    with contextlib.closing(sqlite3.connect(tmp_path / "trackio/dynmap_rl.db")) as database:
+        rows = database.execute("SELECT run_name, step, metrics FROM metrics ORDER BY step").fetchall()
+    name = (tmp_path / "run").as_posix()
+    assert [(run, step, json.loads(metrics)) for run, step, metrics in rows] == [
+        (name, 1, {"loss": 1.0}),
+        (name, 2, {"loss": 0.5}),
+    ]
+
+
 def test_what_is_unknown_or_not_installed_is_one_line_before_anything_is_written(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="--logger is one of tensorboard, wandb, trackio, not 'neptune'"):
         check_logger("neptune")
@@ -71,6 +122,6 @@ def test_what_is_unknown_or_not_installed_is_one_line_before_anything_is_written
         result = run(tmp_path, recipe, "--logger", "wandb")
         assert (result.returncode, result.stderr) == (
             2,
-            "error: --logger wandb needs it: pip install wandb\n",
+            "error: --logger wandb needs its package: pip install '.[wandb]'\n",
         )
     assert not any(tmp_path.iterdir())

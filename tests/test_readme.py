@@ -146,7 +146,9 @@ def test_the_spread_over_world_models_is_that_of_the_results():
     results = ROOT / "recipes/results"
     assert markdown_spread(results) in README
     rows = {row["row"]: row for row in spread(results)}
-    plain, velocity = (f"{rows[row]['mean']:.1f} (std {rows[row]['std']:.1f})" for row in ("Only-RGB", "RGB+[V]"))
+    plain, velocity = (
+        f"{rows[row]['mean']:.1f} (std {rows[row]['std']:.1f})" for row in ("Only-RGB", "RGB+[V]")
+    )
     said = f"over three world models each, velocity alone reaches {velocity} and Only-RGB {plain}, and"
     assert said in " ".join(README.split())
 

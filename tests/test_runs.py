@@ -36,7 +36,7 @@ def test_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "replace", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         runs.write_json(path, 2)
-    assert runs.read_json(path) == 1
+    assert runs.read_json(path, int) == 1
 
 
 def test_run_reopens_with_the_same_settings_only(tmp_path):

@@ -103,7 +103,7 @@ def add_dynamics(
     table = read_table(root, info, list({"timestamp", *old, *([] if track else [state])}))
 
     def read(name: str, dtype=np.float64) -> np.ndarray:
-        return read_column(root, name, table[name], dtype).numpy().reshape(len(table), -1)
+        return read_column(root, info, table, name, dtype).numpy()
 
     if track:
         names, angles, tracks = ["x", "y"], [], _track(root, info, camera, threshold)
@@ -147,7 +147,8 @@ def entry_names(info: dict, column: str) -> list[str]:
     size, names = math.prod(feature["shape"]), feature.get("names")
     if isinstance(names, dict):  # by group, as in {"motors": [...]}
         names = [name for group in names.values() if isinstance(group, list) for name in group]
-    return [str(name) for name in names] if names and len(names) == size else [str(i) for i in range(size)]
+    named = isinstance(names, list) and len(names) == size
+    return [str(name) for name in names] if named else [str(i) for i in range(size)]
 
 
 def _check_output(root: Path, output: Path) -> None:

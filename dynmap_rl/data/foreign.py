@@ -17,7 +17,7 @@ from dynmap_rl.modules import DYNAMICS
 from .dynamics import entry_names, parse_entries
 from .frames import choose_camera, iterate_frames
 from .loading import FRAME_SHAPE
-from .reading import find_dataset, read_column, read_info, read_table, spans
+from .reading import find_dataset, read_column, read_info, read_split, read_table, spans
 
 LONGEST = 120  # steps of a piece: longer ones make batches of whole pieces slow
 
@@ -91,8 +91,7 @@ def load_foreign(
     goal_column, entries = layout["goal"] or ("action", [])
     table = read_table(root, info, list({*columns.values(), goal_column}))
     numbers = {
-        key: read_column(root, name, table[name]).reshape(len(table), -1)
-        for key, name in (columns | {"goal": goal_column}).items()
+        key: read_column(root, info, table, name) for key, name in (columns | {"goal": goal_column}).items()
     }
     numbers["goal"] = numbers["goal"][:, entries]
     rows = dict(spans(table["episode_index"].to_numpy()))
@@ -151,8 +150,8 @@ def _check_goal(root: Path, info: dict, goal: str | None) -> tuple[str, list[int
 def _split(root: Path, info: dict, episodes: list[int]) -> dict[str, list[int]]:
     named = info.get("splits") or {}
     if {"train", "eval"} <= named.keys():
-        borders = {name: [int(number) for number in named[name].split(":")] for name in ("train", "eval")}
-        splits = {name: [e for e in episodes if a <= e < b] for name, (a, b) in borders.items()}
+        members = {name: read_split(root, info, name) for name in ("train", "eval")}
+        splits = {name: [e for e in episodes if e in members[name]] for name in members}
         if not all(splits.values()):
             raise ValueError(
                 f"{root} names splits train and eval, but not both have episodes that are long enough"

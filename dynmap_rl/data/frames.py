@@ -9,13 +9,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from dynmap_rl.hub import first_line
 
-from .reading import decode_image, spans
+from .reading import decode_image, image_files, read_file, spans
 
 TOLERANCE = 1e-4  # s, LeRobot's own, between a timestamp and the video's frame
+PLACE = "chunk_index", "file_index", "from_timestamp"  # of an episode in the video files
 BLOCK = 100  # frames decoded at a time: full-sized ones of a whole episode may not fit into memory
 
 
@@ -51,16 +51,17 @@ def iterate_frames(
     Raises:
         ValueError: a file is damaged; the message names it.
     """
-    episodes = _read_episodes(root) if info["features"][camera]["dtype"] == "video" else None
-    columns = ["episode_index", "timestamp", *([] if episodes else [camera])]
+    video = info["features"][camera]["dtype"] == "video"
+    episodes = _read_episodes(root, camera) if video else {}
+    columns = ["episode_index", "timestamp", *([] if video else [camera])]
     largest = math.prod(info["features"][camera]["shape"])
     for file in sorted((root / "data").glob("*/*.parquet")):
-        table = _read(file, columns)
+        table = read_file(file, columns)
         for episode, span in spans(table["episode_index"].to_numpy()):
             rows = table.slice(span.start, span.stop - span.start)
             blocks = (
                 _decode_video(root, info, episodes, camera, rows)
-                if episodes
+                if video
                 else _decode(file, camera, rows, largest)
             )
             frames = []
@@ -70,22 +71,15 @@ def iterate_frames(
             yield episode, np.stack(frames), width / frames[0].shape[1]
 
 
-def _read(file: Path, columns: list[str]) -> pa.Table:
-    try:
-        return pq.ParquetFile(file).read(columns)
-    except (OSError, pa.ArrowException) as error:
-        raise ValueError(f"{file} is damaged ({error}); restore the dataset") from error
-
-
-def _read_episodes(root: Path) -> dict[int, dict]:
+def _read_episodes(root: Path, camera: str) -> dict[int, dict]:
     """Where each episode's frames are in the video files."""
     files = sorted((root / "meta" / "episodes").glob("*/*.parquet"))
-    names = [n for n in pq.read_schema(files[0]).names if n.startswith("videos/")] if files else []
-    return {r["episode_index"]: r for f in files for r in _read(f, ["episode_index", *names]).to_pylist()}
+    names = ["episode_index", *(f"videos/{camera}/{key}" for key in PLACE)]
+    return {row["episode_index"]: row for file in files for row in read_file(file, names).to_pylist()}
 
 
 def _decode(file: Path, camera: str, rows: pa.Table, largest: int) -> Iterator[list[np.ndarray]]:
-    images = rows[camera].combine_chunks().field("bytes")
+    images = image_files(file, camera, rows[camera])
     for start in range(0, len(images), BLOCK):
         block = []
         for row in range(start, min(start + BLOCK, len(images))):
@@ -107,13 +101,18 @@ def _decode_video(
     with quiet():
         from lerobot.datasets.video_utils import decode_video_frames
 
-    episode = episodes[rows["episode_index"][0].as_py()]
-    chunk, number = (episode[f"videos/{camera}/{key}"] for key in ("chunk_index", "file_index"))
-    path = Path(info["video_path"].format(video_key=camera, chunk_index=chunk, file_index=number))
+    try:
+        episode = episodes[rows["episode_index"][0].as_py()]
+        chunk, number, start = (episode[f"videos/{camera}/{key}"] for key in PLACE)
+        path = Path(info["video_path"].format(video_key=camera, chunk_index=chunk, file_index=number))
+        times = start + rows["timestamp"].to_numpy().astype(np.float64)
+    except (AttributeError, LookupError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{root} does not say where its videos are ({error}); restore the dataset"
+        ) from error
     if path.is_absolute() or ".." in path.parts:
         raise ValueError(f"{root} names a video outside of itself, {path}; restore the dataset")
     path = root / path
-    times = episode[f"videos/{camera}/from_timestamp"] + rows["timestamp"].to_numpy().astype(np.float64)
     for start in range(0, len(times), BLOCK):
         some = times[start : start + BLOCK].tolist()
         try:

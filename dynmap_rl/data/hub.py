@@ -15,6 +15,7 @@ from .loading import META, load_dataset, load_meta
 from .writing import FPS, quiet
 
 PICTURE = "picture.png"
+FOLDERS = ["data/", "meta/", "videos/", "images/"]  # of a LeRobot dataset
 PAPER = "Visual Imitation Learning of Non-Prehensile Manipulation Tasks with Dynamics-Supervised Models"
 CITATION = f"""\
 @misc{{mustafa_dynamics_mapping,
@@ -47,7 +48,8 @@ How it was made: PyMunk simulates, pygame draws, {maker}. The command was
 
 
 def push_dataset(root: str | Path, repo_id: str) -> None:
-    """Upload a recording to the Hugging Face hub; what is there already is not sent again.
+    """Upload a recording to the Hugging Face hub; what is there already is not sent again, and the files of an earlier
+    recording that this one does not have are deleted there.
 
     A card (what it is, columns with units, license, paper) and a picture go with it.
 
@@ -57,11 +59,18 @@ def push_dataset(root: str | Path, repo_id: str) -> None:
     """
     meta = load_meta(root)
     with quiet():
+        from huggingface_hub import HfApi
         from lerobot.datasets import LeRobotDataset
 
+        hub = {"repo_id": repo_id, "repo_type": "dataset"}
         try:
             dataset = LeRobotDataset(repo_id, root=root, video_backend="pyav")
             draw_episodes(load_dataset(root, "train"), Path(root) / PICTURE)
+            HfApi().create_repo(**hub, exist_ok=True)
+            # LeRobot's own upload would leave stale files; after this one it has the card and the tag to add.
+            HfApi().upload_folder(
+                **hub, folder_path=root, ignore_patterns=["images/"], delete_patterns=FOLDERS
+            )
             dataset.push_to_hub(
                 tags=["dynamics", "world-model", "imitation-learning"],
                 license="mit",

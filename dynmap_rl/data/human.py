@@ -99,7 +99,7 @@ def list_shards(root: str | Path, task: str) -> list[Shard]:
 
 def next_scene(root: str | Path, task: str) -> int:
     """The number of the first scene of the split ``train`` after all that episodes were kept of."""
-    rows = [row for shard in list_shards(root, task) for row in read_json(shard.folder / ROWS)]
+    rows = [row for shard in list_shards(root, task) for row in read_json(shard.folder / ROWS, list)]
     numbers = [row["scene_seed"] - scene_seed("train", 0) for row in rows]
     return 1 + max((n for n in numbers if 0 <= n < SEEDS_PER_SPLIT), default=-1)
 

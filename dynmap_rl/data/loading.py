@@ -7,6 +7,7 @@ takes long to import, makes folders for datasets that are not there, and asks th
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from numbers import Real
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,26 @@ import pyarrow as pa
 import torch
 from tensordict import TensorDict
 
-from .reading import decode_image, find_dataset, read_column, read_info, read_metadata, read_table
+from .reading import (
+    decode_image,
+    find_dataset,
+    image_files,
+    read_column,
+    read_info,
+    read_metadata,
+    read_split,
+    read_table,
+)
 
 META = "meta/dynmap.json"
+RANGE = {"low": [Real], "high": [Real]}
+META_FORM = {
+    "task": str,
+    "kind": str,
+    "splits": {"train": [int], "eval": [int]},
+    "normalization": dict.fromkeys(("action", "goal", "position", "velocity", "acceleration"), RANGE),
+    "episodes": [{"episode_index": int, "pushes": [[int]]}],
+}
 CAMERA = "observation.images.front"
 FRAME_SHAPE = (64, 64, 3)  # height, width, RGB
 NEEDED = {
@@ -52,7 +70,7 @@ def load_dataset(dataset: str | Path, split: str | None = None) -> TensorDict:
     if split is not None:
         table = _select_split(root, info, table, split)
     shape = _episodes_and_steps(root, table)
-    data = {key: read_column(root, name, table[name]).reshape(*shape, -1) for key, name in columns.items()}
+    data = {key: read_column(root, info, table, name).unflatten(0, shape) for key, name in columns.items()}
     data["goal"] = data["agent_pos"][..., -2:].clone()
     data["pixels"] = _decode_frames(root, table[CAMERA]).unflatten(0, shape)
     data["disturbed"] = _mark_pushes(root, table, shape)
@@ -78,7 +96,7 @@ def load_meta(dataset: str | Path) -> dict:
             f"{dataset} has no {META}, with scenes and normalisation: it is a LeRobot dataset that "
             "recipes/collect.py did not record; record one, or train on this one with --task none"
         )
-    return read_metadata(root / META)
+    return read_metadata(root / META, META_FORM)
 
 
 def _choose_columns(root: Path, info: dict) -> dict:
@@ -102,12 +120,9 @@ def _choose_columns(root: Path, info: dict) -> dict:
 
 
 def _select_split(root: Path, info: dict, table: pa.Table, split: str) -> pa.Table:
-    splits = info.get("splits") or {}
-    if split not in splits:
-        raise ValueError(f"{root} has no split {split!r}; choose from {sorted(splits)}")
-    first, end = (int(number) for number in splits[split].split(":"))
+    members = read_split(root, info, split)
     episode = table["episode_index"].to_numpy()
-    return table.filter(pa.array((episode >= first) & (episode < end)))
+    return table.filter(pa.array((episode >= members.start) & (episode < members.stop)))
 
 
 def _episodes_and_steps(root: Path, table: pa.Table) -> tuple[int, int]:
@@ -120,8 +135,8 @@ def _episodes_and_steps(root: Path, table: pa.Table) -> tuple[int, int]:
 
 def _mark_pushes(root: Path, table: pa.Table, shape: tuple[int, int]) -> torch.Tensor:
     disturbed = torch.zeros(*shape, 1, dtype=torch.bool)
-    rows = read_metadata(root / META)["episodes"] if (root / META).exists() else []
-    pushes = {row["episode_index"]: row.get("pushes", ()) for row in rows}
+    rows = load_meta(root)["episodes"] if (root / META).exists() else []
+    pushes = {row["episode_index"]: row["pushes"] for row in rows}
     for episode, index in enumerate(table["episode_index"].to_numpy()[:: shape[1]].tolist()):
         for start, end in pushes.get(index, ()):
             disturbed[episode, start:end] = True
@@ -130,7 +145,7 @@ def _mark_pushes(root: Path, table: pa.Table, shape: tuple[int, int]) -> torch.T
 
 def _decode_frames(root: Path, column: pa.ChunkedArray) -> torch.Tensor:
     """PNG files to uint8 ``[N, 3, 64, 64]``, in threads: the decoder releases the interpreter's lock."""
-    files = column.combine_chunks().field("bytes")
+    files = image_files(root, CAMERA, column)
     height, width, channels = FRAME_SHAPE
     pixels = np.empty((len(files), channels, height, width), dtype=np.uint8)
 

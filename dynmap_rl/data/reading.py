@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 from itertools import pairwise
 from pathlib import Path
 
@@ -15,8 +16,10 @@ import torch
 from PIL import Image
 
 from dynmap_rl.hub import first_line, is_hub_id
+from dynmap_rl.runs import check_form
 
 LEROBOT_VERSION = "v3.0"
+INFO = {"total_frames": int, "features": {str: {"dtype": str, "shape": [int]}}}
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
@@ -53,18 +56,20 @@ def find_dataset(dataset: str | Path) -> Path:
         ) from error
 
 
-def read_metadata(path: Path) -> dict:
-    """A JSON file of a dataset.
+def read_metadata(path: Path, form=dict) -> dict:
+    """A JSON file of a dataset, which has a form (see :func:`dynmap_rl.runs.check_form`).
 
     Raises:
-        ValueError: it is damaged, or not there.
+        ValueError: it is damaged, not there, or of another form.
     """
     try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError) as error:
+        value = json.loads(path.read_text())
+    except (OSError, ValueError, RecursionError) as error:
         raise ValueError(
             f"{path} cannot be read ({error}); restore it or record the dataset again"
         ) from error
+    check_form(value, form, str(path))
+    return value
 
 
 def read_info(root: Path) -> dict:
@@ -83,23 +88,63 @@ def read_info(root: Path) -> dict:
         raise ValueError(
             f"{root} is of LeRobot's format {version}, not {LEROBOT_VERSION}; convert it with LeRobot's script"
         )
+    check_form(info, INFO, str(path))
+    check_form(info.get("splits") or {}, {str: str}, f"{path}, splits")
     return info
+
+
+def read_split(root: Path, info: dict, name: str) -> range:
+    """The episodes of a split.
+
+    Raises:
+        ValueError: the dataset does not name it, or not as ``FIRST:END``.
+    """
+    if name not in (splits := info.get("splits") or {}):
+        raise ValueError(f"{root} has no split {name!r}; choose from {sorted(splits)}")
+    try:
+        first, end = map(int, splits[name].split(":"))
+    except ValueError as error:
+        raise ValueError(
+            f"{root} has a split {name} {splits[name]!r}, not FIRST:END; restore its meta/info.json"
+        ) from error
+    return range(first, end)
+
+
+def read_file(file: Path, columns: list[str]) -> pa.Table:
+    """Columns of one parquet file.
+
+    Raises:
+        ValueError: it is damaged, lacks a column (which PyArrow leaves out without a word), or counts by other than
+            whole numbers.
+    """
+    try:
+        table = pq.ParquetFile(file).read(columns)
+    except (OSError, pa.ArrowException) as error:
+        raise ValueError(
+            f"{file} is a damaged or unfinished data file ({error}); restore it or record the dataset again"
+        ) from error
+    if missing := [name for name in columns if name not in table.column_names]:
+        raise ValueError(
+            f"{file} lacks the columns {', '.join(missing)}; restore it or record the dataset again"
+        )
+    for name in {"index", "episode_index"} & {*columns}:
+        if not pa.types.is_integer(table.schema.field(name).type) or table[name].null_count:
+            raise ValueError(f"{file} has no whole numbers in {name}; restore it or record the dataset again")
+    return table
 
 
 def read_table(root: Path, info: dict, columns: list[str]) -> pa.Table:
     """These columns of all data files, and ``index`` and ``episode_index``, in order of time.
 
     Raises:
-        ValueError: a file is damaged, or frames are missing.
+        ValueError: a file is damaged, or columns or frames are missing.
     """
     files = sorted((root / "data").glob("*/*.parquet"))
+    tables = [read_file(file, ["index", "episode_index", *columns]) for file in files]
     try:
-        tables = [pq.ParquetFile(file).read(["index", "episode_index", *columns]) for file in files]
         table = pa.concat_tables(tables) if tables else []
-    except (OSError, pa.ArrowException) as error:
-        raise ValueError(
-            f"{root} has a damaged or unfinished data file ({error}); restore it or record the dataset again"
-        ) from error
+    except pa.ArrowException as error:
+        raise ValueError(f"{root} has data files of different columns ({error}); record it again") from error
     if not len(table) or len(table) != info["total_frames"]:
         raise ValueError(
             f"{root} is incomplete: {len(table)} of {info['total_frames']} frames; restore it or record it again"
@@ -107,20 +152,38 @@ def read_table(root: Path, info: dict, columns: list[str]) -> pa.Table:
     return table.sort_by("index")
 
 
-def read_column(root: Path, name: str, column: pa.ChunkedArray, dtype=np.float32) -> torch.Tensor:
-    """The column's numbers, one after the other, as memory of their own.
+def read_column(root: Path, info: dict, table: pa.Table, name: str, dtype=np.float32) -> torch.Tensor:
+    """A column's numbers ``[N, D]`` as memory of their own.
 
     Raises:
-        ValueError: some are missing or not finite.
+        ValueError: some are missing or not finite, or there are not as many as ``meta/info.json`` says.
     """
-    flat = column.combine_chunks()
+    flat = table[name].combine_chunks()
     while pa.types.is_list(flat.type) or pa.types.is_fixed_size_list(flat.type):
         flat = flat.flatten()
     values = flat.to_numpy(zero_copy_only=False)
-    values = values.astype(bool if values.dtype == bool else dtype)
-    if column.null_count or not np.isfinite(values).all():
+    if values.dtype.kind not in "biuf" or table[name].null_count or not np.isfinite(values).all():
         raise ValueError(f"{root} has numbers in {name} that are missing or not finite; record it again")
-    return torch.from_numpy(values)
+    size = math.prod(info["features"][name]["shape"]) if name in info["features"] else 1
+    if len(values) != size * len(table):
+        raise ValueError(f"{root} does not have {size} numbers in every row of {name}; record it again")
+    return torch.from_numpy(values.astype(bool if values.dtype == bool else dtype)).reshape(-1, size)
+
+
+def image_files(where: Path, name: str, column: pa.ChunkedArray) -> pa.Array:
+    """The image files in a camera's column, which is of the dataset or the file ``where``.
+
+    Raises:
+        ValueError: it holds no files.
+    """
+    array = column.combine_chunks()
+    try:
+        files = array.field("bytes")
+    except (AttributeError, KeyError):
+        files = None
+    if files is None or not pa.types.is_binary(files.type):
+        raise ValueError(f"{where} holds no image files in {name}; restore it or record it again")
+    return files
 
 
 def spans(episode: np.ndarray) -> list[tuple[int, slice]]:

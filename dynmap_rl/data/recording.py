@@ -266,7 +266,7 @@ def describe_episode(task: str, plan: Plan, episode: TensorDict) -> dict:
 
 def merge_shards(shards: list[Shard], folder: Path, settings: dict) -> None:
     """All episodes of shards as one dataset with its metadata; the first ``episodes`` of the settings are for training."""
-    rows = [{"split": s.split, **row} for s in shards for row in read_json(s.folder / ROWS)]
+    rows = [{"split": s.split, **row} for s in shards for row in read_json(s.folder / ROWS, list)]
     train = settings["episodes"]
     splits = {"train": [0, train], "eval": [train, len(rows)]}
     episodes = merge_datasets([s.folder for s in shards], folder, splits)

@@ -144,7 +144,7 @@ def task_of_expert(expert: str | Path, task: BalanceReaching) -> BalanceReaching
     Raises:
         ValueError: ``task`` has no such states.
     """
-    facts = read_json(find_expert(expert) / f"{list_checkpoints(expert)[-1]}.json")
+    facts = read_json(find_expert(expert) / f"{list_checkpoints(expert)[-1]}.json", {"task": str})
     sees = get_task(facts["task"], from_file=True)
     if not issubclass(task.ranges.scene, sees.ranges.scene):
         raise ValueError(f"the expert {expert} sees states of {sees.name}, which {task.name} does not have")

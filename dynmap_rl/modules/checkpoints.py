@@ -146,7 +146,9 @@ def task_of_run(run: Path) -> str | None:
         ValueError: it was trained on a dataset of no task of ours, and there is no simulator for it.
     """
     settings = read_json(run / "config.json") if (run / "config.json").exists() else {}
-    if (task := settings.get("task")) == NO_TASK:
+    if not isinstance(task := settings.get("task"), str | None):
+        raise ValueError(f"{run / 'config.json'} names no task, but {task}; restore it")
+    if task == NO_TASK:
         raise ValueError(
             f"{run} was trained on {settings.get('dataset')}, for which there is no simulator; its eval.json has its "
             "errors on held-out episodes"
@@ -158,9 +160,7 @@ def _read_arguments(folder: Path) -> dict:
     path = Path(folder) / "arguments.json"
     if not path.exists():
         raise ValueError(f"{folder} holds no checkpoint (no arguments.json); train one first")
-    if not isinstance(arguments := read_json(path), dict):
-        raise ValueError(f"{path} holds no arguments of a module")
-    return arguments
+    return read_json(path)
 
 
 def _blank(size: int) -> Normalizer:

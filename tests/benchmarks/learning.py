@@ -16,17 +16,16 @@ from dynmap_rl.objectives.world_model import WorldModelLoss, rms
 from dynmap_rl.training import make_optimizer, step
 
 SUPERVISION = ("position", "velocity")
-WINDOWS, STEPS = 16, 24
 
 
-def world_model_training(dataset: str, decode_all: bool = True) -> dict:
+def world_model_training(dataset: str, decode_all: bool = True, count: int = 16, steps: int = 24) -> dict:
     """Frames a second of a training step of ``recipes/decoupled.py``, against the same model in plain float32 with
     LSTM cells in a time loop, which decodes every frame (or as many as the recipe does)."""
     torch.set_num_threads(2)
     episodes = data.load_dataset(dataset, "train")
     constants = data.load_meta(dataset)["normalization"]
     generator = torch.Generator().manual_seed(0)
-    windows = data.sample_windows(episodes, WINDOWS, STEPS, generator)
+    windows = data.sample_windows(episodes, count, steps, generator)
     fast = make_world_model(constants, SUPERVISION).to(memory_format=torch.channels_last)
     loss_module = WorldModelLoss(fast, rgb_steps=8)
     optimizer = make_optimizer(fast, 1e-4, 1e-4)
@@ -37,7 +36,7 @@ def world_model_training(dataset: str, decode_all: bool = True) -> dict:
                 losses = loss_module(windows)
             step(sum(losses.values()), optimizer)
 
-        return WINDOWS * STEPS / seconds(run)
+        return count * steps / seconds(run)
 
     slow = PlainWorldModel(make_world_model(constants, SUPERVISION))
     plain_optimizer = torch.optim.AdamW(slow.parameters(), 1e-4)
@@ -50,7 +49,7 @@ def world_model_training(dataset: str, decode_all: bool = True) -> dict:
             nn.utils.clip_grad_norm_(slow.parameters(), 1.0)
             plain_optimizer.step()
 
-        return WINDOWS * STEPS / seconds(run)
+        return count * steps / seconds(run)
 
     return compare(ours, plain, repeats=7)
 
@@ -61,14 +60,20 @@ class PlainWorldModel(nn.Module):
     def __init__(self, model: WorldModel):
         super().__init__()
         self.model = model
-        sizes = [model.latent_size + model.transition.action.size, model.hidden_size]
-        self.cells = nn.ModuleList(nn.LSTMCell(size, model.hidden_size) for size in sizes)
+        layers = model.transition.lstm.lstm1, model.transition.lstm.lstm2
+        self.cells = nn.ModuleList(nn.LSTMCell(layer.input_size, layer.hidden_size) for layer in layers)
+        for cell, layer in zip(self.cells, layers, strict=True):
+            cell.load_state_dict({k.removesuffix("_l0"): v for k, v in layer.state_dict().items()})
 
     def loss(self, windows, rgb_steps: int | None) -> torch.Tensor:
         model, pixels = self.model, windows["pixels"]
         encoder = model.encoder
         frames = pixels.flatten(0, 1).float() / 255
-        maps = encoder.top(encoder.stem(nn.functional.pixel_unshuffle(frames - 0.5, 4)).relu()).flatten(1)
+        blocks = (
+            nn.functional.pad(nn.functional.pixel_unshuffle(frames, 4), (1, 1, 1, 1)) - 0.5
+        )  # black around
+        stem = nn.functional.conv2d(blocks, encoder.stem.weight, encoder.stem.bias)
+        maps = encoder.top(stem.relu()).flatten(1)
         color = 5 * encoder.color(frames.mean((2, 3)) - 0.5)
         latent = (encoder.project(maps) + color).unflatten(0, pixels.shape[:2])
         action = model.transition.action.normalize(windows["action"])
@@ -94,7 +99,8 @@ class PlainWorldModel(nn.Module):
 
 
 def evaluation(dataset: str, episodes: int = 1000, single: int = 5) -> dict:
-    """Seconds an episode: 1,000 of them as one batch, against one after the other through the Gymnasium id."""
+    """Seconds an episode: 1,000 of them as one batch, against one after the other through the Gymnasium id; both encode
+    frames in the precision of training."""
     torch.set_num_threads(1)
     constants = data.load_meta(dataset)["normalization"]
     world_model = make_world_model(constants, SUPERVISION).eval()
@@ -119,7 +125,7 @@ def evaluation(dataset: str, episodes: int = 1000, single: int = 5) -> dict:
                 while not done:
                     frame = torch.from_numpy(observation["pixels"]).permute(2, 0, 1)[None]
                     goal = torch.from_numpy(observation["agent_pos"])[None, 3:]
-                    latent = world_model.encode(frame)
+                    latent = world_model.encode(frame, mixed=True)
                     action, memory = policy.step(latent, state[0], state[2], goal, memory)
                     _, state = world_model.step(latent, action, state)
                     observation, _, terminated, truncated, _ = env.step(action[0].numpy())

@@ -42,12 +42,12 @@ def window_sampling(dataset: str, batches: int = 5) -> dict:
     return compare(ours, theirs, repeats=3)
 
 
-def to_tensordict(dataset: str) -> dict:
+def to_tensordict(dataset: str, count: int = 3000) -> dict:
     """Frames a second into one TensorDict, against iterating ``LeRobotDataset``."""
     frames = data.load_dataset(dataset).numel()
     lerobot = _lerobot(dataset)
 
-    def theirs(count: int = 3000):
+    def theirs():
         return count / seconds(lambda: [lerobot[i] for i in range(count)])
 
     return compare(lambda: frames / seconds(lambda: data.load_dataset(dataset)), theirs, repeats=2)

@@ -20,21 +20,21 @@ from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.world import ACCELERATION_LIMIT, EPISODE_STEPS
 
 GOAL = 0.97
-ITERATIONS = 45
 EXPERT = Path(__file__).parents[2] / "recipes" / "expert.py"
 
 
-def ours(seed: int = 0) -> float:
+def ours(seed: int, iterations: int, num_envs: int, episodes: int) -> float:
     """``recipes/expert.py`` on one core; it writes its own seconds and success rates."""
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, str(EXPERT), "--run", folder, "--seed", str(seed), "--threads", "1"]
-        command += ["--checkpoint_every", "1", "--final_episodes", "200"]
+        command += ["--iterations", str(iterations), "--num_envs", str(num_envs), "--checkpoint_every", "1"]
+        command += ["--eval_episodes", str(episodes), "--final_episodes", str(episodes)]
         subprocess.run(command, check=True, capture_output=True)
         facts = [json.loads(path.read_text()) for path in sorted(Path(folder).glob("checkpoint/*.json"))]
     return next((f["seconds"] for f in facts if f["success"] >= GOAL), math.inf)
 
 
-def stable_baselines(seed: int = 0) -> float:
+def stable_baselines(seed: int, iterations: int, num_envs: int, episodes: int) -> float:
     """Stable-Baselines3's PPO on the Gymnasium id, with the same settings, on one core."""
     from stable_baselines3 import PPO
     from stable_baselines3.common.callbacks import BaseCallback
@@ -62,7 +62,7 @@ def stable_baselines(seed: int = 0) -> float:
             return math.isinf(self.reached)
 
     def success(model) -> float:
-        rngs = [np.random.default_rng(scene_seed("exploration", 10_000_000 + i)) for i in range(200)]
+        rngs = [np.random.default_rng(scene_seed("exploration", 10_000_000 + i)) for i in range(episodes)]
         worlds = [task.make_world(task.sample_scene(rng)) for rng in rngs]
         for _ in range(EPISODE_STEPS):
             action, _ = model.predict(np.stack([task.state(w) for w in worlds]), deterministic=True)
@@ -76,7 +76,7 @@ def stable_baselines(seed: int = 0) -> float:
 
     model = PPO(
         "MlpPolicy",
-        make_vec_env(make, 64, seed=seed),
+        make_vec_env(make, num_envs, seed=seed),
         learning_rate=lambda left: 5e-4 * (0.1 + 0.9 * left),
         n_steps=EPISODE_STEPS,
         batch_size=1024,
@@ -91,12 +91,13 @@ def stable_baselines(seed: int = 0) -> float:
         device="cpu",
     )
     watch = Watch()
-    model.learn(ITERATIONS * 64 * EPISODE_STEPS, callback=watch)
+    model.learn(iterations * num_envs * EPISODE_STEPS, callback=watch)
     return watch.reached
 
 
-def ppo(seeds=(0, 1, 2)) -> dict:
+def ppo(seeds=(0, 1, 2), iterations: int = 45, num_envs: int = 64, episodes: int = 200) -> dict:
     """Seconds to the goal, the median over seeds; infinite where 345,600 frames were not enough."""
-    pairs = [(ours(seed), stable_baselines(seed)) for seed in seeds]
+    sizes = iterations, num_envs, episodes
+    pairs = [(ours(seed, *sizes), stable_baselines(seed, *sizes)) for seed in seeds]
     a, b = (float(np.median(times)) for times in zip(*pairs, strict=True))
     return {"ours": a, "theirs": b, "ratio": a / b, "pairs": pairs}

@@ -29,7 +29,7 @@ RESULTS = Path(__file__).parents[2] / "recipes" / "results" / "benchmarks.json"
 DATASET = "datasets/balance_reaching"
 US, MS = 1e6, 1e3
 
-# name: (what, against, unit, factor from seconds or rates to it, what the ratio should be, function)
+# name: (what, against, unit, factor from seconds or rates to it, what the ratio should be, function of its sizes)
 ROWS = {
     "control_step": (
         "control step, state", "bare loop of 50 x (set velocity, `space.step`)", "us", US, "<= 1.15", simulation.control_step
@@ -41,23 +41,23 @@ ROWS = {
     "ppo": ("PPO, time to 97 % success", "Stable-Baselines3 on our Gymnasium id", "s", 1, "<= 0.33", ppo.ppo),
     "training": (
         "world-model training, frames/s", "the same in plain fp32, LSTM cells in a loop", "1/s", 1, ">= 6",
-        lambda: learning.world_model_training(DATASET),
+        lambda **sizes: learning.world_model_training(DATASET, **sizes),
     ),
     "training_decode_8": (
         "the same", "the same, decoding as few frames as we do", "1/s", 1, "",
-        lambda: learning.world_model_training(DATASET, decode_all=False),
+        lambda **sizes: learning.world_model_training(DATASET, decode_all=False, **sizes),
     ),
     "windows": (
         "windows of 24 steps", "`DataLoader` over `LeRobotDataset`", "1/s", 1, ">= 100",
-        lambda: loading.window_sampling(DATASET),
+        lambda **sizes: loading.window_sampling(DATASET, **sizes),
     ),
     "to_tensordict": (
         "dataset to TensorDict, frames/s", "iterating `LeRobotDataset`", "1/s", 1, ">= 10",
-        lambda: loading.to_tensordict(DATASET),
+        lambda **sizes: loading.to_tensordict(DATASET, **sizes),
     ),
     "evaluation": (
         "evaluation, an episode of 1,000", "one at a time through the Gymnasium id", "ms", MS, "<= 0.2",
-        lambda: learning.evaluation(DATASET),
+        lambda **sizes: learning.evaluation(DATASET, **sizes),
     ),
     "import": ("`import dynmap_rl`", "`import gymnasium`", "s", 1, "ours < 0.3 s", starting.import_package),
     "help": ("`--help` of the slowest recipe", "`import torch`", "s", 1, "ours < 1 s", starting.show_help),

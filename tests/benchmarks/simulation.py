@@ -127,17 +127,20 @@ def batch(num_envs: int = 64, steps: int = 60) -> dict:
     return compare(ours, worlds_alone)
 
 
-def processes() -> dict:
+def processes(num_envs: int = 64, steps: int = 400, amount: int = 20_000_000) -> dict:
     """Control steps a second in two processes of 64 worlds, against one; ``limit`` is the same for plain arithmetic,
     which shares nothing: what this machine's second core gives."""
-    result = compare(lambda: _rate(_step_worlds, 2), lambda: _rate(_step_worlds, 1), repeats=3)
-    return result | {"limit": compare(lambda: _rate(_count, 2), lambda: _rate(_count, 1), repeats=3)["ratio"]}
+
+    def two_and_one(*work):
+        return compare(lambda: _rate(2, *work), lambda: _rate(1, *work), repeats=3)
+
+    return two_and_one(_step_worlds, num_envs, steps) | {"limit": two_and_one(_count, amount)["ratio"]}
 
 
-def _rate(work, count: int) -> float:
+def _rate(count: int, *work) -> float:
     context = multiprocessing.get_context("spawn")
     barrier, queue = context.Barrier(count), context.Queue()
-    workers = [context.Process(target=_timed, args=(work, barrier, queue)) for _ in range(count)]
+    workers = [context.Process(target=_timed, args=(barrier, queue, *work)) for _ in range(count)]
     for worker in workers:
         worker.start()
     rates = [queue.get() for _ in workers]
@@ -146,14 +149,14 @@ def _rate(work, count: int) -> float:
     return sum(rates)
 
 
-def _timed(work, barrier, queue) -> None:
+def _timed(barrier, queue, work, *sizes) -> None:
     torch.set_num_threads(1)
-    run, amount = work()
+    run, amount = work(*sizes)
     barrier.wait()
     queue.put(amount / seconds(run))
 
 
-def _step_worlds(num_envs: int = 64, steps: int = 400):
+def _step_worlds(num_envs: int, steps: int):
     env = DynmapBatchedEnv(num_envs=num_envs, seed=0)
     td = env.reset()
     actions = torch.from_numpy(np.stack([smooth_actions(i, steps) for i in range(num_envs)], 1)).float()
@@ -166,5 +169,5 @@ def _step_worlds(num_envs: int = 64, steps: int = 400):
     return run, num_envs * steps
 
 
-def _count(amount: int = 20_000_000):
+def _count(amount: int):
     return lambda: sum(range(amount)), amount

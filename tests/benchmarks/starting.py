@@ -21,8 +21,8 @@ def import_package() -> dict:
     return compare(lambda: _run("-c", "import dynmap_rl"), lambda: _run("-c", "import gymnasium"))
 
 
-def show_help() -> dict:
+def show_help(pattern: str = "*.py") -> dict:
     """Seconds for the slowest recipe's ``--help``, against ``import torch``."""
-    recipes = sorted(map(str, RECIPES.glob("*.py")))
+    recipes = sorted(map(str, RECIPES.glob(pattern)))
     slowest = max(recipes, key=lambda recipe: min(_run(recipe, "--help") for _ in range(2)))
     return compare(lambda: _run(slowest, "--help"), lambda: _run("-c", "import torch"), repeats=5)

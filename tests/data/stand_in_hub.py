@@ -110,7 +110,8 @@ class Handler(BaseHTTPRequestHandler):
             ]
             return self.answer({"files": [{**mode, "shouldIgnore": False} for mode in modes]})
         if action == "commit":
-            name = repo.commit({**files, **changed_files(data)})
+            changed = {**files, **changed_files(data)}
+            name = repo.commit({path: content for path, content in changed.items() if content is not None})
             return self.answer(
                 {
                     "commitOid": name,
@@ -147,8 +148,8 @@ def describe(name: str, content: bytes) -> dict:
     return {"path": name, "size": len(content), "oid": hashlib.sha1(content).hexdigest()}
 
 
-def changed_files(data: bytes) -> dict[str, bytes]:
-    """The files of a commit's lines of JSON."""
+def changed_files(data: bytes) -> dict[str, bytes | None]:
+    """The files of a commit's lines of JSON; None for those that it deletes."""
     files = {}
     for line in data.splitlines():
         operation = json.loads(line)
@@ -157,6 +158,8 @@ def changed_files(data: bytes) -> dict[str, bytes]:
             files[value["path"]] = base64.b64decode(value["content"])
         elif operation["key"] == "lfsFile":
             files[value["path"]] = BLOBS[value["oid"]]
+        elif operation["key"] == "deletedFile":
+            files[value["path"]] = None
     return files
 
 

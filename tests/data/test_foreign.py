@@ -148,6 +148,22 @@ def test_a_video_outside_of_the_dataset_is_not_opened(folders, tmp_path):
         load_foreign(root, 20)
 
 
+def test_videos_that_are_nowhere_are_named(folders, tmp_path):
+    import shutil
+
+    root = shutil.copytree(folders / "plain_videos", tmp_path / "copy")
+    path = root / "meta/info.json"
+    info = json.loads(path.read_text())
+    for place in (None, "{nothing}", "videos/{video_key.nothing}", "{"):
+        path.write_text(json.dumps(info | {"video_path": place}))
+        with pytest.raises(ValueError, match="copy does not say where its videos are"):
+            load_foreign(root, 20)
+    path.write_text(json.dumps(info))
+    shutil.rmtree(root / "meta/episodes")
+    with pytest.raises(ValueError, match="copy does not say where its videos are"):
+        load_foreign(root, 20)
+
+
 def test_a_damaged_video_is_named(folders, tmp_path):
     import shutil
 

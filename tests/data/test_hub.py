@@ -17,43 +17,63 @@ from PIL import Image
 from dynmap_rl.data import load_dataset
 from dynmap_rl.data.hub import draw_episodes
 
-ONLINE = """
+RECIPE = Path(__file__).parents[2] / "recipes" / "collect.py"
+ONLINE = f"""
+import runpy
+import sys
 import urllib.request
 from unittest import mock
 
 import pytest
 from huggingface_hub import RepoCard, constants
+from lerobot.datasets import LeRobotDataset
 
-from dynmap_rl.data import load_dataset, load_meta, push_dataset
+from dynmap_rl.data import load_dataset, load_meta
 from dynmap_rl.runs import write_json
 
 name = "someone/demonstrations"
-with pytest.raises(ValueError, match=f"no dataset at {{name}}, neither as a folder nor .*; check the name"):
-    load_dataset(name)
-for note in ("first", "second"):
-    meta = load_meta({root!r}) | {{"note": note}}
-    write_json({root!r} + "/meta/dynmap.json", meta)
+
+
+def push(folder, episodes, eval_episodes):
+    sizes = "--episodes", str(episodes), "--eval_episodes", str(eval_episodes)
+    sys.argv = ["collect.py", "--output", folder, *sizes, "--workers", "1", "--push_to_hub", name]
     with mock.patch.object(RepoCard, "validate"):  # asks an address that cannot be changed
-        push_dataset({root!r}, name)
-    if note == "first":
-        urllib.request.urlopen(constants.ENDPOINT + "/cut", b"")
-        with pytest.raises(ValueError, match="no dataset at .*; check the name and the network"):
-            load_dataset(name)
-        urllib.request.urlopen(constants.ENDPOINT + "/mend", b"")
-    assert (load_dataset(name) == load_dataset({root!r})).all()
-    assert load_meta(name) == meta
+        runpy.run_path({str(RECIPE)!r}, run_name="__main__")
 
-from lerobot.datasets import LeRobotDataset
 
+def check_pull(folder):
+    assert (load_dataset(name) == load_dataset(folder)).all()
+    assert load_meta(name) == load_meta(folder)
+
+
+def no_dataset():
+    return pytest.raises(ValueError, match=f"no dataset at {{name}}, neither .*; check the name and the network")
+
+
+with no_dataset():
+    load_dataset(name)
+push("dataset", 4, 2)
+part = LeRobotDataset(name, episodes=[2], video_backend="pyav")
+assert len(part) == 120 and (part[7]["dynamics.position"] == load_dataset("dataset")[2, 7]["dynamics", "position"]).all()
+assert len([*part.root.glob("data/*/*.parquet")]) == 1, "of three"
+
+urllib.request.urlopen(constants.ENDPOINT + "/cut", b"")
+with no_dataset():
+    load_dataset(name)
+urllib.request.urlopen(constants.ENDPOINT + "/mend", b"")
+check_pull("dataset")
 assert len(LeRobotDataset(name, video_backend="pyav")) == 6 * 120
-part = LeRobotDataset(name, episodes=[1], video_backend="pyav")
-assert len(part) == 120 and (part[7]["dynamics.position"] == load_dataset({root!r})[1, 7]["dynamics", "position"]).all()
+write_json("dataset/meta/dynmap.json", load_meta("dataset") | {{"note": "another"}})
+push("dataset", 4, 2)
+check_pull("dataset")
+push("smaller", 3, 1)
+check_pull("smaller")
 """
 OFFLINE = """
 from dynmap_rl.data import load_dataset, load_meta
 
-assert (load_dataset("someone/demonstrations") == load_dataset({root!r})).all()
-assert load_meta("someone/demonstrations")["note"] == "second"
+assert (load_dataset("someone/demonstrations") == load_dataset("smaller")).all()
+assert load_meta("someone/demonstrations") == load_meta("smaller")
 """
 NO_NETWORK = """
 import pytest
@@ -63,7 +83,7 @@ from dynmap_rl.data import load_dataset, push_dataset
 with pytest.raises(ValueError, match="no dataset at someone/else, .*; check the name and the network"):
     load_dataset("someone/else")
 with pytest.raises(OSError, match="cannot push .* to someone/else .*; check the name, the network"):
-    push_dataset({root!r}, "someone/else")
+    push_dataset("dataset", "someone/else")
 """
 
 
@@ -76,34 +96,44 @@ def hub():
     process.wait()
 
 
-def run(code, endpoint, home, offline="0"):
-    environment = {
-        "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
-        "HF_ENDPOINT": endpoint,
-        "HF_TOKEN": "hf_dummy",
-        "HF_HUB_DISABLE_XET": "1",
-        "HF_HUB_OFFLINE": offline,
-        "HF_HOME": str(home),
-        "HF_LEROBOT_HOME": str(home / "lerobot"),
-    }
-    command = [sys.executable, "-c", code]
-    result = subprocess.run(command, env={**os.environ, **environment}, capture_output=True, text=True)
-    assert result.returncode == 0, result.stderr
+@pytest.fixture
+def run(installed, tmp_path):
+    """Run code on the installed package, with a hub at an address."""
+
+    def run(code, endpoint, offline="0"):
+        environment = {
+            "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
+            "PYTHONPATH": str(installed),
+            "HF_ENDPOINT": endpoint,
+            "HF_TOKEN": "hf_dummy",
+            "HF_HUB_DISABLE_XET": "1",
+            "HF_HUB_OFFLINE": offline,
+            "HF_HOME": str(tmp_path / "home"),
+            "HF_LEROBOT_HOME": str(tmp_path / "home/lerobot"),
+        }
+        command, environment = [sys.executable, "-c", code], os.environ | environment
+        result = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+        assert result.returncode == 0, result.stderr
+        return result.stdout
+
+    return run
 
 
 @pytest.mark.slow
-def test_push_a_pull_that_is_cut_off_pull_push_again_and_use_offline(recording, tmp_path, hub):
-    root = str(shutil.copytree(recording, tmp_path / "dataset"))
-    run(ONLINE.format(root=root), hub, tmp_path / "home")
-    run(OFFLINE.format(root=root), hub, tmp_path / "home", offline="1")
-    run(OFFLINE.format(root=root), "http://127.0.0.1:9", tmp_path / "home")  # no network, and nobody said so
+def test_push_a_pull_that_is_cut_off_pull_push_again_and_use_offline(recording, tmp_path, hub, run):
+    shutil.copytree(recording, tmp_path / "dataset")
+    printed = run(ONLINE, hub).splitlines()
+    assert printed[0] == "complete already: dataset"
+    assert printed[-2:] == ["done: smaller", "pushed: someone/demonstrations"]
+    run(OFFLINE, hub, offline="1")
+    run(OFFLINE, "http://127.0.0.1:9")  # no network, and nobody said so
 
     address = f"{hub}/datasets/someone/demonstrations/resolve/v3.0"
     card = urllib.request.urlopen(f"{address}/README.md").read().decode()
     assert "license: mit" in card
     assert "| `dynamics.velocity` | 6 |" in card
-    assert "train 0 to 3, eval 4 to 5" in card
-    assert "--episodes 4 --eval_episodes 2" in card
+    assert "train 0 to 2, eval 3 to 3" in card
+    assert "--episodes 3 --eval_episodes 1" in card
     assert "More Information Needed" not in card
     picture = Image.open(urllib.request.urlopen(f"{address}/picture.png"))
     assert "](picture.png)" in card and picture.size == (8 * 128, 3 * 128)
@@ -136,15 +166,15 @@ with pytest.raises(ValueError, match="no policy at someone/else, neither as a fo
 
 
 @pytest.mark.slow
-def test_a_run_folder_goes_there_and_back_and_is_found_offline(tmp_path, hub):
-    run(RUN.format(push=True), hub, tmp_path / "home")
-    run(RUN.format(push=False), hub, tmp_path / "home", offline="1")
+def test_a_run_folder_goes_there_and_back_and_is_found_offline(hub, run):
+    run(RUN.format(push=True), hub)
+    run(RUN.format(push=False), hub, offline="1")
 
 
 @pytest.mark.slow
-def test_without_a_network_there_is_one_clear_error(recording, tmp_path):
-    root = str(shutil.copytree(recording, tmp_path / "dataset"))
-    run(NO_NETWORK.format(root=root), "http://127.0.0.1:9", tmp_path / "home")  # nobody listens
+def test_without_a_network_there_is_one_clear_error(recording, tmp_path, run):
+    shutil.copytree(recording, tmp_path / "dataset")
+    run(NO_NETWORK, "http://127.0.0.1:9")  # nobody listens
 
 
 def test_the_picture_shows_frames(recording, tmp_path):

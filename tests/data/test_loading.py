@@ -59,6 +59,12 @@ def test_splits_are_the_parts_of_the_whole(recording):
         load_dataset(recording, "test")
 
 
+def test_a_split_that_names_no_episodes_is_refused(copy):
+    change_info(copy, lambda info: info.update(splits={"train": "all"}))
+    with pytest.raises(ValueError, match="copy has a split train 'all', not FIRST:END"):
+        load_dataset(copy, "train")
+
+
 def test_colours_are_in_the_order_red_green_blue(recording):
     episodes, rows = load_dataset(recording), load_meta(recording)["episodes"]
     for episode, row in zip(episodes, rows, strict=True):
@@ -147,6 +153,16 @@ def empty_row(root):
     rewrite(root, change)
 
 
+def another_column(name, value):
+    """The same in every row."""
+
+    def damage(root):
+        rewrite(root, lambda table: replace_column(table, name, pa.array([value] * len(table))))
+
+    damage.__name__ = f"{name} of {value}"
+    return damage
+
+
 def another_frame(make, name):
     def damage(root):
         def change(table):
@@ -181,6 +197,10 @@ def blank(height, width, kind=".png"):
         (unequal_lengths, "of 119 to 120 steps"),
         (nan, "action that are missing or not finite"),
         (empty_row, "next.reward that are missing or not finite"),
+        (another_column("action", [0.0] * 4), "does not have 3 numbers in every row of action"),
+        (another_column("next.reward", "much"), "next.reward that are missing or not finite"),
+        (another_column("index", 0.5), "no whole numbers in index"),
+        (another_column(CAMERA, 0), f"holds no image files in {CAMERA}"),
         (another_frame(lambda png: png[:20], "broken_frame"), "frame 3 cannot be decoded"),
         (another_frame(lambda png: png[:40], "truncated_frame"), "frame 3 cannot be decoded"),
         (another_frame(lambda png: b"", "no_frame"), "frame 3 cannot be decoded"),

@@ -36,12 +36,29 @@ def play(env: gym.vector.VectorEnv, steps: int) -> list[np.ndarray]:
         "import dynmap_rl, sys; assert 'gymnasium' not in sys.modules; import gymnasium",
         "import dynmap_rl, importlib.util; importlib.util.find_spec('gymnasium'); import gymnasium",
         "import dynmap_rl; from gymnasium.envs import registration; import gymnasium",
+        "import dynmap_rl, importlib; importlib.reload(dynmap_rl); import gymnasium",
         "import gymnasium; gymnasium.make('dynmap_rl:dynmap_rl/BinDropping-v0')",
     ],
 )
 def test_the_ids_are_there_whatever_is_imported_first(imports):
     use = "import sys; [gymnasium.make(name) for name in dynmap_rl.GYMNASIUM_IDS]; assert 'dynmap_rl' not in str(sys.meta_path)"
     subprocess.run([sys.executable, "-c", f"{imports}; import dynmap_rl; {use}"], check=True)
+
+
+def test_the_ids_are_there_when_gymnasium_s_first_import_fails_and_the_next_succeeds():
+    script = """
+import sys
+import dynmap_rl
+sys.modules["gymnasium.core"] = None  # cannot be imported
+try:
+    import gymnasium
+except ImportError:
+    del sys.modules["gymnasium.core"]
+import gymnasium
+[gymnasium.make(name) for name in dynmap_rl.GYMNASIUM_IDS]
+assert "dynmap_rl" not in str(sys.meta_path)
+"""
+    subprocess.run([sys.executable, "-c", script], check=True)
 
 
 @every_id

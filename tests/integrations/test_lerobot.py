@@ -1,7 +1,8 @@
-"""The environment and the policy that LeRobot sees, and run folders that become LeRobot's and ours again."""
+"""The environment and the policy that LeRobot sees."""
 
 import dataclasses
 import json
+import shutil
 
 import pytest
 import torch
@@ -17,12 +18,7 @@ from dynmap_rl import modules
 from dynmap_rl.data import load_dataset, load_meta
 from dynmap_rl.envs import DynmapBatchedEnv
 from dynmap_rl.evaluation import scene_seeds
-from dynmap_rl.integrations.lerobot import (
-    DynmapConfig,
-    DynmapEnvConfig,
-    export_to_lerobot,
-    import_from_lerobot,
-)
+from dynmap_rl.integrations.lerobot import DynmapConfig, DynmapEnvConfig
 from dynmap_rl.integrations.lerobot.modeling_dynmap import DynmapPolicy
 from dynmap_rl.training import fingerprint
 
@@ -107,17 +103,18 @@ def test_env_config_refuses_what_the_tasks_are_not(field, value):
         DynmapEnvConfig(**{field: value})
 
 
-def load_windows(recording, policy, starts):
+def load_windows(recording, policy, starts, episodes=None):
     """What LeRobot's loader and preprocessor make of the windows from these frames on."""
-    dataset = LeRobotDataset("user/small", root=recording, video_backend="pyav")
+    arguments = {"root": recording, "episodes": episodes, "video_backend": "pyav"}
+    dataset = LeRobotDataset("user/small", **arguments)
     delta = resolve_delta_timestamps(policy.config, dataset.meta)
-    dataset = LeRobotDataset("user/small", root=recording, video_backend="pyav", delta_timestamps=delta)
+    dataset = LeRobotDataset("user/small", **arguments, delta_timestamps=delta)
     batch = torch.utils.data.default_collate([dataset[i] for i in starts])
     return make_pre_post_processors(policy.config, dataset_stats=dataset.meta.stats)[0](batch)
 
 
-def new_policy(recording, **settings):
-    dataset = LeRobotDataset("user/small", root=recording, video_backend="pyav")
+def new_policy(recording, episodes=None, **settings):
+    dataset = LeRobotDataset("user/small", root=recording, episodes=episodes, video_backend="pyav")
     return make_policy(make_policy_config("dynmap", **(SMALL | settings)), ds_meta=dataset.meta)
 
 
@@ -138,6 +135,24 @@ def test_windows_are_those_of_our_own_loader(recording):
         assert torch.equal(windows["disturbed"][row], expected["disturbed"])
         there = [row != 2 or step < 3 for step in range(6)]
         assert windows["collector", "mask"][row].tolist() == there
+
+
+def test_a_part_from_the_middle_has_its_own_dynamics(recording, tmp_path):
+    """Where LeRobot has downloaded the data files of some episodes alone."""
+    part = shutil.copytree(recording, tmp_path / "part")
+    files = sorted((part / "data").glob("*/*.parquet"))
+    assert len(files) == 3, "two episodes in each"
+    files[0].unlink(), files[2].unlink()
+    policy = new_policy(part, [2, 3])
+    windows = policy.make_windows(load_windows(part, policy, [0, 130], [2, 3]))
+    expected = load_dataset(recording)[2:4]
+    assert (windows["dynamics"][0] == expected["dynamics"][0, :6]).all()
+    assert (windows["dynamics"][1] == expected["dynamics"][1, 10:16]).all()
+    assert torch.equal(windows["disturbed"][1], expected["disturbed"][1, 10:16])
+
+    shutil.copy(files[1], files[2])
+    with pytest.raises(ValueError, match="frames with the same index"):
+        new_policy(part, [2, 3])
 
 
 @pytest.mark.parametrize(
@@ -193,63 +208,6 @@ def test_recurrent_control_is_that_of_our_actor_and_forgets_at_a_reset(recording
     assert not torch.equal(act(), first)
     policy.reset()
     assert torch.equal(act(), first)
-
-
-def make_run(folder, kind, keypoints=False, goal=2):
-    sizes = {"action": 3, "goal": goal, "position": 6}
-    meta = {name: {"low": [-1.0] * n, "high": [2.0] * n} for name, n in sizes.items()}
-    world_model = modules.make_world_model(meta, ("position",), 16, 24, keypoints)
-    policy = modules.make_policy(meta, kind, world_model, width=20)
-    modules.save_world_model(folder / "world_model", world_model)
-    modules.save_policy(folder / "seed_1" / "policy", policy, world_model)
-    return world_model, policy
-
-
-@pytest.mark.parametrize(("kind", "keypoints"), [("recurrent", False), ("feedforward", True)])
-def test_a_run_exports_to_lerobot_and_back(tmp_path, kind, keypoints):
-    run, exported, back = tmp_path / "run", tmp_path / "pretrained_model", tmp_path / "back"
-    world_model, policy = make_run(run, kind, keypoints)
-    export_to_lerobot(run, exported, seed=1)
-    theirs = make_policy(config_of(exported), env_cfg=DynmapEnvConfig())
-    assert type(theirs) is DynmapPolicy
-    preprocessor, postprocessor = make_pre_post_processors(theirs.config, pretrained_path=str(exported))
-    import_from_lerobot(exported, back, seed=1)
-    ours = modules.load_world_model(back / "world_model"), modules.load_policy(back / "seed_1" / "policy")
-    for before, after in zip((world_model, policy), ours, strict=True):
-        assert fingerprint(before) == fingerprint(after)
-
-    frames = torch.randint(0, 256, (4, 2, 3, 64, 64), dtype=torch.uint8)
-    states = torch.rand(4, 2, 5)
-    again = DynmapPolicy.from_pretrained(export_to_lerobot(back, tmp_path / "again", seed=1))
-    state, policy_state = world_model.initial_state(2), policy.initial_state(2)
-    for pixels, agent_pos in zip(frames, states, strict=True):
-        batch = {"observation.images.front": pixels / 255, "observation.state": agent_pos}
-        action = postprocessor(theirs.select_action(preprocessor(batch)))
-        assert torch.equal(action, again.select_action(batch))
-        with torch.no_grad():
-            latent = world_model.encode(pixels, mixed=True)
-            expected, policy_state = policy.step(latent, state[0], state[2], agent_pos[:, -2:], policy_state)
-            state = world_model.step(latent, expected, state)[1]
-        assert torch.equal(action, expected)
-
-
-def config_of(folder):
-    config = DynmapConfig.from_pretrained(folder)
-    config.pretrained_path = folder
-    return config
-
-
-def test_export_and_import_say_what_is_missing(tmp_path):
-    with pytest.raises(ValueError, match="train one first"):
-        export_to_lerobot(tmp_path, tmp_path / "out")
-    make_run(tmp_path / "other", "recurrent", goal=4)
-    with pytest.raises(ValueError, match="another scene"):
-        export_to_lerobot(tmp_path / "other", tmp_path / "out", seed=1)
-    with pytest.raises(ValueError, match=r"no config\.json"):
-        import_from_lerobot(tmp_path, tmp_path / "run")
-    make_policy_config("act", push_to_hub=False, device="cpu").save_pretrained(tmp_path)
-    with pytest.raises(ValueError, match="the type act"):
-        import_from_lerobot(tmp_path, tmp_path / "run")
 
 
 def test_settings_that_cannot_be_are_refused(recording):

@@ -1,4 +1,4 @@
-"""The collect recipe: records, says that it is done, and answers mistakes with one line."""
+"""The collect recipe: records, says that it is done, and answers mistakes with one line. It pushes in test_hub.py."""
 
 import os
 import subprocess
@@ -31,14 +31,6 @@ def test_records_where_it_says_and_then_says_that_it_is_complete(
     assert [p.name for p in (tmp_path / "datasets").iterdir()] == [name]
     main(config)
     assert capsys.readouterr().out == f"complete already: datasets/{name}\n"
-
-
-def test_pushes_what_is_there_already(recording, monkeypatch, capsys):
-    pushed = []
-    monkeypatch.setattr("dynmap_rl.data.hub.push_dataset", lambda *arguments: pushed.append(arguments))
-    main(Config(output=recording, episodes=4, eval_episodes=2, push_to_hub="someone/demonstrations"))
-    assert pushed == [(recording, "someone/demonstrations")]
-    assert "pushed: someone/demonstrations" in capsys.readouterr().out
 
 
 def test_a_mistake_is_one_line(recording, tmp_path):

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from commands import run
+from commands import open_in_browser, run
 from safetensors.torch import load_file, save_file
 
 from dynmap_rl.envs.tasks import TASKS
@@ -41,6 +41,18 @@ def test_smoke_run_leaves_everything_behind(smoke):
     assert not (run_folder / "features").exists()
     page = (run_folder / "report.html").read_text()
     assert "SR 89 (0.9) %" in page and page.count('src="data:image/') == 3
+
+
+def test_its_page_is_whole_in_a_browser(smoke, tmp_path):
+    folder, _ = smoke
+    page = folder / "runs/decoupled/balance_reaching/position_velocity_recurrent_smoke/report.html"
+    seen = open_in_browser(page, tmp_path / "page.png")
+    assert seen["loaded"] and seen["console"] == []
+    assert seen["requests"] == [page.as_uri()[:100]], "nothing from elsewhere"
+    assert len(seen["images"]) == 3 and min(seen["images"]) > 100, "reconstruction, dynamics and rollouts"
+    assert seen["drawings"] and min(seen["drawings"]) > 500, "the curves"
+    for said in ("RGB+[P+V], recurrent policy", "SR 89 (0.9) %", "Rollouts in closed loop", "policy_updates"):
+        assert said in seen["text"]
 
 
 def test_the_same_command_again_says_that_it_is_done(smoke, monkeypatch, capsys):

@@ -59,8 +59,7 @@ def test_a_run_and_its_copy_for_lerobot_get_the_same_row(trained, tmp_path):
     lerobot = pytest.importorskip("dynmap_rl.integrations.lerobot")
     exported = lerobot.export_to_lerobot(trained, tmp_path / "exported", seed=1)
     output = tmp_path / "exported.json"
-    arguments = "--task", "bin_dropping", "--output", output
-    result = run(tmp_path, "evaluate", "--policy", exported, *arguments, *common)
+    result = run(tmp_path, "evaluate", "--policy", exported, "--output", output, *common)
     assert result.returncode == 0, result.stderr
     assert read_json(output)["rows"] == ours["rows"]
 

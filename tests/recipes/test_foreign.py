@@ -1,6 +1,7 @@
-"""Decoupled and joint training on a dataset of no task of ours, as commands."""
+"""Decoupled and joint training on a dataset of no task of ours, as commands on the installed package."""
 
-import commands
+from pathlib import Path
+
 import pytest
 import torch
 from foreign_dataset import make_foreign
@@ -9,9 +10,7 @@ from dynmap_rl.data import add_dynamics
 from dynmap_rl.modules import load_policy, load_world_model
 from dynmap_rl.runs import read_json, read_metrics
 
-
-def run(folder, recipe, *arguments):
-    return commands.run(folder, recipe, "--task", "none", "--smoke", *arguments)
+RECIPES = Path(__file__).parents[2] / "recipes"
 
 
 @pytest.fixture(scope="module")
@@ -26,9 +25,9 @@ def dataset(tmp_path_factory):
     ("recipe", "arguments", "goal"),
     [("decoupled", [], 0), ("joint", ["--goal", "observation.state:0,1", "--policy", "feedforward"], 2)],
 )
-def test_smoke_run_holds_held_out_errors(dataset, tmp_path, recipe, arguments, goal):
-    arguments = ["--dataset", str(dataset), *arguments]
-    result = run(tmp_path, recipe, *arguments)
+def test_smoke_run_holds_held_out_errors(command, dataset, tmp_path, recipe, arguments, goal):
+    words = RECIPES / f"{recipe}.py", "--task", "none", "--smoke", "--dataset", dataset, *arguments
+    result = command(tmp_path, *words)
     assert result.returncode == 0, result.stderr
     assert "RGB+[P+V], " in result.stdout and "no closed loop" in result.stdout
     [folder] = (tmp_path / "runs" / recipe / "gliding").iterdir()
@@ -48,7 +47,7 @@ def test_smoke_run_holds_held_out_errors(dataset, tmp_path, recipe, arguments, g
     assert policy(latent, hidden1, hidden2, torch.zeros(1, 2, goal)).shape == (1, 2, 2)
     assert world_model.decode_dynamics(latent, hidden1, hidden2)["position"].shape == (1, 2, 3)
     assert "what the world model predicted from the frame before" in (folder / "report.html").read_text()
-    again = run(tmp_path, recipe, *arguments)
+    again = command(tmp_path, *words)
     assert "is done" in again.stdout and result.stdout.split("\n")[1] in again.stdout
 
 

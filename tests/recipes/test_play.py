@@ -3,9 +3,10 @@
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 from commands import run
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from dynmap_rl.data import keep_episode, load_dataset, load_meta, publish_episodes
 from dynmap_rl.data.human import next_scene
@@ -14,6 +15,7 @@ from dynmap_rl.envs.renderer import pygame
 from dynmap_rl.modules import make_policy, make_world_model, save_policy, save_world_model
 from dynmap_rl.play import PlayWindow, Session, session
 from dynmap_rl.runs import write_json
+from recipes.play import save_film
 
 
 def press(window, *names):
@@ -79,6 +81,38 @@ def test_a_policy_is_watched_and_filmed(trained, tmp_path):
     assert result.returncode == 0, result.stderr
     with Image.open(tmp_path / "film.gif") as film:
         assert film.n_frames == 3
+
+
+def test_imagination_begins_at_its_step_of_every_episode(trained, tmp_path, monkeypatch):
+    seen, draw = [], PlayWindow.draw
+
+    def watch(window):
+        seen.append((window.session.world.steps, window.session.imagining))
+        return draw(window)
+
+    monkeypatch.setattr(PlayWindow, "draw", watch)
+    arguments = "--policy", trained, "--imagine_from", 3, "--steps", 140 + 6, "--size", 64
+    result = run(tmp_path, "play", *arguments)
+    assert result.returncode == 0, result.stderr
+    steps = [step for step, _ in seen]
+    assert steps[:6] == steps[-6:] == [1, 2, 3, 4, 5, 6], "two episodes"
+    assert all(imagining == (step > 3) for step, imagining in seen)
+
+
+def test_what_stands_still_keeps_its_colours_in_a_film(tmp_path):
+    rng = np.random.default_rng(0)
+    still = np.repeat(np.repeat(rng.integers(0, 255, (4, 4, 3), dtype=np.uint8), 16, 0), 16, 1)
+    frames = []
+    for i in range(40):  # beside it everything changes, to other colours
+        moving = np.repeat(np.repeat(rng.integers(6 * i, 6 * i + 20, (8, 8, 3), dtype=np.uint8), 8, 0), 8, 1)
+        frames.append(np.concatenate([still, moving], 1))
+    save_film(frames, tmp_path / "film.gif")
+    with Image.open(tmp_path / "film.gif") as film:
+        shown = [np.asarray(frame.convert("RGB"), dtype=int) for frame in ImageSequence.Iterator(film)]
+    assert len(shown) == 20 and shown[0].shape == (32, 64, 3)
+    # But for the last columns, which the smaller picture blends with what changes.
+    assert all((frame[:, :28] == shown[0][:, :28]).all() for frame in shown)
+    assert np.abs(shown[0][2:6, 2:6] - still[8, 8]).max() < 30, "and nearly its own"
 
 
 def test_what_a_person_drove_becomes_a_dataset(tmp_path, monkeypatch):
@@ -150,6 +184,8 @@ def test_without_a_display_there_is_one_clear_line(tmp_path, monkeypatch):
         (["--task", "juggling"], "unknown task"),
         (["--steps", "0"], "--steps at least 1"),
         (["--gif", "film.gif"], "--gif needs --steps"),
+        (["--imagine_from", "20"], "--imagine_from is a step of 1 to 119, and needs --policy"),
+        (["--policy", "balance_reaching", "--imagine_from", "120"], "--imagine_from is a step of 1 to 119"),
         (["--push_to_hub", "someone/mine"], "--push_to_hub needs --record"),
         (["--expert", "bin_dropping"], "sees states of bin_dropping, which balance_reaching does not have"),
         (["--driver", "policy"], "--driver is one of hand, expert, not 'policy'"),

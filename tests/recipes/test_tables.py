@@ -1,6 +1,5 @@
 """The grid of the paper's tables: its cells, its runs, and what is printed of its results."""
 
-import importlib
 import json
 import os
 import re
@@ -13,9 +12,11 @@ from pathlib import Path
 
 import commands
 import pytest
+from filelock import FileLock
 
 from dynmap_rl.cells import list_cells
 from dynmap_rl.evaluation.paper import TABLES, parse_supervision, row_name
+from dynmap_rl.evaluation.tables import COLUMNS
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "tables.py"
 
@@ -45,6 +46,33 @@ def test_there_is_a_cell_for_every_one_of_the_paper():
         task = own.get("--task", "balance_reaching")
         found.add((task, training, own.get("--policy", "recurrent"), row))
     assert found == expected
+
+
+def test_a_table_is_chosen_alone(tmp_path):
+    """By the task of its columns, and with the world models of task 1 that tables II and III need."""
+
+    def listed(*arguments):
+        lines = run(tmp_path, "--dry_run", *arguments).stdout.splitlines()
+        return {line.split()[-1] for line in lines[:-1]}, lines[-1]
+
+    by_name = {cell.name: cell for cell in list_cells()}
+    first, said = listed("--table", "I")
+    own = {name for name, cell in by_name.items() if cell.task == "balance_reaching"}
+    assert first == own and "0 of 35 cells" in said
+    assert sum("world_model_" in name for name in first) == 10, "the further world models of the claims"
+    for table, columns in COLUMNS.items():
+        [task] = {column[0] for column in columns}
+        found, said = listed("--table", table)
+        cells = {name for name, cell in by_name.items() if cell.task == task}
+        needed = {by_name[name].needs for name in cells} - {None}
+        assert found == cells | needed
+        minutes = sum(by_name[name].minutes for name in found)
+        assert said.endswith(f"about {minutes / 60:.1f} hours of one core are left")
+    assert listed("--table", "I,II,III") == listed() and len(listed()[0]) == len(by_name)
+    two, _ = listed("--table", "II, III", "--only", "joint_none")
+    assert two == {f"{task}_joint_none_recurrent" for task in TASKS}
+    one, _ = listed("--table", "I", "--only", "joint_none")
+    assert one == {"balance_reaching_joint_none_recurrent"}
 
 
 def test_cells_run_once_and_are_printed_beside_the_paper(recordings, tmp_path):
@@ -110,30 +138,39 @@ def test_a_cell_that_fails_says_where_to_look_and_the_others_go_on(tmp_path):
     assert "holds a run with other settings" in result.stderr
 
 
-def test_ctrl_c_begins_no_other_cell(monkeypatch):
-    begun = []
-
-    def run_cell(cell, config, root):
-        begun.append(cell)
-        time.sleep(0.2)
-        os.kill(os.getpid(), signal.SIGINT)  # as a terminal sends it to all of its processes
-        time.sleep(0.2)
-
-    recipe = importlib.import_module("recipes.tables")
-    monkeypatch.setattr(recipe, "run_cell", run_cell)
-    previous = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            recipe.launch(list_cells(), recipe.Config())
-    finally:
-        signal.signal(signal.SIGINT, previous)
-    assert len(begun) == 1
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("send", "number"),
+    [(os.killpg, signal.SIGINT), (os.kill, signal.SIGKILL)],
+    ids=["Ctrl-C", "parent killed"],
+)
+def test_what_stops_the_command_stops_its_cells_and_begins_no_other(recordings, tmp_path, send, number):
+    """Ctrl-C, which a terminal sends to all processes, and a kill of the first one alone."""
+    commands.place_recordings(tmp_path, recordings, TASKS[0])
+    first, second = (
+        tmp_path / f"runs/tables_smoke/balance_reaching_joint_{row}_recurrent"
+        for row in ("velocity", "velocity_acceleration")
+    )
+    smoke = "--smoke", "--results", "results", "--only"
+    command = [sys.executable, str(RECIPE), *smoke, "balance_reaching_joint_velocity"]
+    with subprocess.Popen(command, cwd=tmp_path, start_new_session=True) as process:
+        while not (first / "config.json").exists():
+            assert process.poll() is None
+            time.sleep(0.02)
+        send(process.pid, number)
+    assert process.returncode == (1 if number == signal.SIGINT else -number)
+    with FileLock(first / ".lock", timeout=60):
+        assert not (first / "eval.json").exists() and not second.exists()
+    again = commands.run(tmp_path, "tables", *smoke, first.name)
+    assert again.stdout == f"done: {first.name}\n", again.stderr
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["--only", "nothing"], "no cell's name holds"),
+        (["--table", "II", "--only", "balance_reaching_joint"], "no cell's name holds"),
+        (["--table", "I,IV"], "--table is I, II or III, or several with commas between, not 'I,IV'"),
         (["--print", "html"], "markdown, json or findings"),
         (["--launcher", "slurm"], "local or ray"),
     ],

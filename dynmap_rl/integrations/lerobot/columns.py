@@ -22,9 +22,10 @@ def read_columns(root: str | Path) -> TensorDict:
         root: its folder.
 
     Returns:
-        ``[N]``, the frame of LeRobot's ``index`` i in row i: ``action`` ``[N, 3]``, ``goal`` ``[N, 2]``,
-        ``("dynamics", "position" | "velocity" | "acceleration")`` ``[N, 6]`` in SI units, and ``disturbed``
-        ``[N, 1]``: the steps in which a push acted, so far as the recording tells.
+        ``[N]``, the frames that are on this machine: ``index`` ``[N]``, LeRobot's number of the frame, which increases;
+        ``action`` ``[N, 3]``, ``goal`` ``[N, 2]``, ``("dynamics", "position" | "velocity" | "acceleration")``
+        ``[N, 6]`` in SI units, and ``disturbed`` ``[N, 1]``: the steps in which a push acted, so far as the recording
+        tells.
 
     Raises:
         ValueError: columns are missing, numbers are not finite, or the files are not on this machine.
@@ -36,13 +37,14 @@ def read_columns(root: str | Path) -> TensorDict:
         raise ValueError(f"{root} lacks the columns {', '.join(sorted(missing))}, which dynmap learns from")
     names = ["index", "episode_index", "frame_index", *NEEDED.values()]
     table = pa.concat_tables([pq.ParquetFile(file).read(names) for file in files]).sort_by("index")
-    if not (table["index"].to_numpy() == np.arange(len(table))).all():
-        raise ValueError(f"{root}: the column index does not count the frames; repair or record the dataset")
+    index = table["index"].to_numpy()
+    if not (np.diff(index) > 0).all():
+        raise ValueError(f"{root} has frames with the same index; repair the dataset or record it again")
     data = {key: torch.from_numpy(np.stack(table[name].to_numpy())).float() for key, name in NEEDED.items()}
     if broken := [NEEDED[key] for key, values in data.items() if not values.isfinite().all()]:
         raise ValueError(f"{root} has numbers in {', '.join(broken)} that are not finite; record it again")
     data["goal"] = data.pop("agent_pos")[:, -2:]
-    data["disturbed"] = _mark_pushes(Path(root), table)
+    data["index"], data["disturbed"] = torch.tensor(index), _mark_pushes(Path(root), table)
     return TensorDict(data, [len(table)])
 
 
@@ -63,6 +65,11 @@ def find_constants(root: str | Path, columns: TensorDict) -> dict[str, dict[str,
     return normalization_constants(columns[None])
 
 
-def is_symmetric(root: str | Path) -> bool:
-    """Whether mirrored and shifted demonstrations of the dataset's task are demonstrations, so far as it tells."""
-    return (Path(root) / META).exists() and get_task(load_meta(root)["task"], from_file=True).symmetric
+def find_task(root: str | Path) -> str | None:
+    """The dataset's task; None where it does not tell, such as one that has been edited."""
+    return load_meta(root)["task"] if (Path(root) / META).exists() else None
+
+
+def is_symmetric(task: str | None) -> bool:
+    """Whether mirrored and shifted demonstrations of a task are demonstrations; not where there is no task."""
+    return task is not None and get_task(task, from_file=True).symmetric

@@ -34,6 +34,8 @@ class DynmapConfig(PreTrainedConfig):
             default what the task is that the dataset tells, and false where it tells none.
         mixed: train, and encode frames in control, in bfloat16 where the processor computes with it.
         optimizer_lr, optimizer_weight_decay: of AdamW.
+        task: that the policy was trained on; written by training where the dataset tells it.
+        source: where its world model is from (see :func:`dynmap_rl.frozen.load_source`); written by training too.
 
     Raises:
         ValueError: an unknown supervision or kind, or windows of less than two steps.
@@ -57,6 +59,8 @@ class DynmapConfig(PreTrainedConfig):
     mixed: bool = True
     optimizer_lr: float = 2e-3
     optimizer_weight_decay: float = 1e-4
+    task: str | None = None
+    source: dict[str, str] | None = None
     # None, for the modules hold constants of their own, in weights that are saved with the rest.
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: dict.fromkeys(("VISUAL", "STATE", "ACTION"), NormalizationMode.IDENTITY)

@@ -7,7 +7,7 @@ from pathlib import Path
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.utils.constants import ACTION, OBS_STATE
 
-from dynmap_rl import modules
+from dynmap_rl import modules, runs
 from dynmap_rl.data.loading import CAMERA, FRAME_SHAPE
 
 from .configuration_dynmap import DynmapConfig
@@ -21,20 +21,25 @@ def export_to_lerobot(run: str | Path, folder: str | Path, seed: int = 0) -> Pat
 
     Args:
         run: a run folder of ours, or its id on the hub (see :func:`dynmap_rl.modules.load_actor`).
-        folder: gets ``config.json``, ``model.safetensors`` and the processors.
+        folder: gets ``config.json``, with the run's task and where its world model is from, ``model.safetensors`` and
+            the processors.
         seed: of the policy.
 
     Raises:
         ValueError: the run holds no such policy, or one of another scene than ours.
     """
-    folder = Path(folder)
+    folder, run = Path(folder), modules.find_run(run)
     actor = modules.load_actor(run, seed)
     world_model, policy = actor.world_model, actor.policy
     sizes = {"action": policy.action.size, "goal": policy.goal.size}
     sizes |= {name: n.size for name, n in world_model.dynamics_decoder.normalizers.items()}
     if other := {name: size for name, size in sizes.items() if size != SIZES[name]}:
         raise ValueError(f"{run} is of another scene than ours, by the sizes of {other}")
+    files = run / "config.json", run / "eval.json"
+    settings, results = (runs.read_json(file) if file.exists() else {} for file in files)
     config = DynmapConfig(
+        task=settings.get("task"),
+        source=results.get("world_model"),
         supervision=",".join(world_model.supervision) or "none",
         kind="recurrent" if isinstance(policy, modules.RecurrentPolicy) else "feedforward",
         latent_size=world_model.latent_size,
@@ -57,11 +62,19 @@ def export_to_lerobot(run: str | Path, folder: str | Path, seed: int = 0) -> Pat
 
 
 def import_from_lerobot(folder: str | Path, run: str | Path, seed: int = 0) -> Path:
-    """Write world model and policy of a ``pretrained_model`` folder as a run folder of ours: ``world_model`` and
-    ``seed_N/policy``, for :func:`dynmap_rl.modules.load_world_model` and :func:`~dynmap_rl.modules.load_policy`.
+    """Write world model and policy of a ``pretrained_model`` folder as a run folder of ours.
+
+    Its task goes into ``config.json``, and where its world model is from into ``eval.json``, so far as the folder tells
+    them. Results of its own it has none.
+
+    Args:
+        folder: of :func:`export_to_lerobot`, or a checkpoint of ``lerobot-train --policy.type=dynmap``.
+        run: gets ``world_model`` and ``seed_N/policy`` too, for ``load_world_model`` and ``load_policy`` of
+            :mod:`dynmap_rl.modules`.
+        seed: that the policy goes by.
 
     Raises:
-        ValueError: the folder holds no policy ``dynmap``.
+        ValueError: the folder holds no policy ``dynmap``, or ``run`` is another run's.
     """
     folder, run = Path(folder), Path(run)
     if not (folder / "config.json").exists():
@@ -69,7 +82,14 @@ def import_from_lerobot(folder: str | Path, run: str | Path, seed: int = 0) -> P
     config = DynmapConfig.from_pretrained(folder)
     if not isinstance(config, DynmapConfig):
         raise ValueError(f"{folder} holds a policy of the type {config.type}, not dynmap")
+    source = config.source or {}
+    settings = {"task": config.task} | ({"dataset": source["dataset"]} if "dataset" in source else {})
+    if (run / "config.json").exists() and runs.read_json(run / "config.json") != settings:
+        raise ValueError(f"{run} holds another run; choose another folder")
     policy = DynmapPolicy.from_pretrained(folder, config=config, strict=True)
+    runs.write_json(run / "config.json", settings)
     modules.save_world_model(run / "world_model", policy.world_model)
     modules.save_policy(run / f"seed_{seed}" / "policy", policy.policy, policy.world_model)
+    if source:
+        runs.write_json(run / "eval.json", {"world_model": source, "imported_from": str(folder)})
     return run

@@ -14,7 +14,7 @@ from dynmap_rl.evaluation.paper import parse_supervision
 from dynmap_rl.modules import DYNAMICS, make_policy, make_world_model, mixed_precision
 from dynmap_rl.objectives import JointLoss, WorldModelLoss
 
-from .columns import find_constants, is_symmetric, read_columns
+from .columns import find_constants, find_task, is_symmetric, read_columns
 from .configuration_dynmap import DynmapConfig
 
 SIZES = {"action": 3, "goal": 2, **dict.fromkeys(DYNAMICS, 6)}
@@ -46,10 +46,14 @@ class DynmapPolicy(PreTrainedPolicy):
         if dataset_meta is not None:
             columns = read_columns(dataset_meta.root)
             constants = find_constants(dataset_meta.root, columns)
+            task = find_task(dataset_meta.root)
             if config.symmetric is None:
-                self.symmetric = is_symmetric(dataset_meta.root)
+                self.symmetric = is_symmetric(task)
+            config.task = task or config.task
+            config.source = {"task": config.task, "training": "joint"} if config.task else None
             # Buffers, to be on the model's device, but no part of a checkpoint.
-            self.register_buffer("disturbed", columns["disturbed"], persistent=False)
+            for name in ("index", "disturbed"):
+                self.register_buffer(name, columns[name], persistent=False)
             for name in DYNAMICS:
                 self.register_buffer(name, columns["dynamics", name], persistent=False)
         sizes = config.latent_size, config.hidden_size, config.keypoints
@@ -94,7 +98,8 @@ class DynmapPolicy(PreTrainedPolicy):
         action, beyond = batch[ACTION], batch["action_is_pad"]
         steps = torch.arange(action.shape[1], device=action.device)
         last = (~beyond).sum(1, keepdim=True) - 1
-        rows = batch["index"].view(-1, 1) + torch.minimum(steps, last)  # (B, T), within the episode
+        index = batch["index"].view(-1, 1) + torch.minimum(steps, last)  # (B, T), within the episode
+        rows = torch.searchsorted(self.index, index)  # of a part of a dataset, other files may not be here
         data = {
             "pixels": to_bytes(batch[self.config.camera]),
             "action": action,
