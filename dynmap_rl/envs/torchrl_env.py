@@ -30,7 +30,8 @@ class DynmapBatchedEnv(EnvBase):
 
     A reset draws each world's scene from the environment's seed, or, where the reset TensorDict has an entry
     ``scene_seed`` ``[N]`` (int64), from that: ``env.reset(TensorDict(scene_seed=torch.arange(n), batch_size=[n]))``.
-    A ``TransformedEnv`` hands on no such entry, but arguments: ``env.reset(scene_seed=torch.arange(n))``.
+    A ``TransformedEnv`` hands on no such entry, but arguments: ``env.reset(scene_seed=torch.arange(n))``. A
+    ``ParallelEnv`` of several hands on only arguments for each: ``env.reset(list_of_kwargs=[{"scene_seed": ...}, ...])``.
 
     Args:
         task: name of the task, or ``"module:Class"`` of your own.
@@ -114,6 +115,10 @@ class DynmapBatchedEnv(EnvBase):
             if (flags := tensordict.get("_reset", None)) is not None:
                 mask = flags.reshape(n).cpu()
             seeds = tensordict.get("scene_seed", scene_seed)
+        if seeds is not None and tuple(seeds.shape) != (n,):
+            raise ValueError(
+                f"scene_seed must have one seed for each of {n} worlds, not {tuple(seeds.shape)}"
+            )
         for i in mask.nonzero().flatten().tolist():
             seed = int(seeds[i]) if seeds is not None else int(self.rng.integers(2**63))
             scene = self.task.sample_scene(np.random.default_rng(seed), self.ranges)

@@ -192,6 +192,35 @@ def test_worlds_in_processes_of_their_own_are_the_same_worlds():
             alone = env.step(alone.set("action", out["action"][worker, :, t]))["next"]
 
 
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*use of fork")
+@pytest.mark.parametrize("processes", [2, 4])
+def test_the_same_trajectories_in_any_number_of_processes(processes):
+    seeds, rng = torch.arange(4), np.random.default_rng(0)
+    actions = torch.from_numpy(rng.normal(0, 0.005, (10, 4, 3))).float()
+
+    def trajectory(env, td):
+        for action in actions:
+            td = env.step(td.set("action", action.view(*env.batch_size, 3)))["next"]
+            yield td["dynamics"].clone().view(-1), td["pixels"].flatten(0, -4)
+
+    alone = DynmapBatchedEnv(num_envs=4, from_pixels=True)
+    expected = list(trajectory(alone, alone.reset(scene_seed=seeds)))
+    make = partial(DynmapBatchedEnv, num_envs=4 // processes, from_pixels=True)
+    env = ParallelEnv(processes, make, mp_start_method="fork")
+    try:
+        td = env.reset(list_of_kwargs=[{"scene_seed": some} for some in seeds.split(4 // processes)])
+        for (dynamics, pixels), (same, drawn) in zip(trajectory(env, td), expected, strict=True):
+            assert (dynamics == same).all() and torch.equal(pixels, drawn)
+    finally:
+        env.close()
+
+
+def test_every_world_has_its_scene_s_seed():
+    with pytest.raises(ValueError, match="one seed for each of 4 worlds, not \\(2,\\)"):
+        DynmapBatchedEnv(num_envs=4).reset(scene_seed=torch.arange(2))
+
+
 @pytest.mark.parametrize(
     "arguments, message",
     [

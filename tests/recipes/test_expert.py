@@ -9,6 +9,7 @@ import torch
 from safetensors.torch import load_file
 
 from dynmap_rl import runs
+from dynmap_rl.experts import ppo
 from recipes.expert import Config, main
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "expert.py"
@@ -116,3 +117,22 @@ def test_help_is_quick_to_import():
     imported = {line.rsplit("|")[-1].strip().split(".")[0] for line in result.stderr.splitlines()}
     assert "draccus" in imported
     assert not imported & {"torch", "lerobot", "pygame", "matplotlib"}
+
+
+def test_a_loss_that_is_not_finite_stops_the_run_and_what_was_kept_stays(tmp_path, monkeypatch):
+    whole, calls = ppo.update, []
+
+    def break_the_third(batch, loss_module, *rest):
+        calls.append(1)
+        if len(calls) == 3:
+            batch["next", "reward"][0] = float("nan")
+        return whole(batch, loss_module, *rest)
+
+    monkeypatch.setattr(ppo, "update", break_the_third)
+    with pytest.raises(ValueError, match="the loss is not finite; what was kept before stays"):
+        main(tiny(tmp_path / "run", iterations=4))
+    assert runs.load_training_state(tmp_path / "run/checkpoint/training_state.pt")["iteration"] == 2
+    assert all(
+        v.isfinite().all() for v in load_file(tmp_path / "run/checkpoint/iteration_002.safetensors").values()
+    )
+    assert [row["step"] for row in metrics(tmp_path / "run")] == [1, 2]

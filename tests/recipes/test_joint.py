@@ -3,6 +3,7 @@
 import pytest
 from commands import place_recordings, run
 
+from dynmap_rl.modules import FeedforwardPolicy, load_actor
 from dynmap_rl.runs import read_json
 
 
@@ -51,3 +52,13 @@ def test_bad_input_is_refused_before_anything_is_written(tmp_path, recipe, argum
     assert result.returncode == 2
     assert message in result.stderr and "Traceback" not in result.stderr
     assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("recipe", "row"), [("joint", "RGB+[P+V]"), ("end_to_end", "End-to-End")])
+def test_a_feedforward_policy(recordings, tmp_path, recipe, row):
+    place_recordings(tmp_path, recordings, "balance_reaching")
+    result = run(tmp_path, recipe, "--smoke", "--policy", "feedforward")
+    assert result.returncode == 0, result.stderr
+    assert f"{row}, feedforward policy, balance_reaching" in result.stdout.replace(", joint,", ",")
+    [folder] = (tmp_path / "runs" / recipe / "balance_reaching").iterdir()
+    assert isinstance(load_actor(folder, 0).policy, FeedforwardPolicy)
