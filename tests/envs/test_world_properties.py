@@ -101,8 +101,8 @@ def test_the_mirrored_world_moves_mirrored(name, seed, wildness):
     fields = asdict(world.scene)
     places = {key: 1 - value for key, value in fields.items() if key.endswith("_x")}
     mirrored = get_task(name).make_world(world.scene.replace(**places, block_shift=-fields["block_shift"]))
-    mirror = np.array([-1, 1, -1])
-    for compared in range(60):
+    mirror, compared = np.array([-1, 1, -1]), 0
+    for _ in range(60):
         action = wild(rng, wildness)
         world.step(action)
         mirrored.step(action * mirror)
@@ -110,4 +110,5 @@ def test_the_mirrored_world_moves_mirrored(name, seed, wildness):
             break
         expected = world.position * np.tile(mirror, 2) + [1, 0, 0, 1, 0, 0]
         np.testing.assert_allclose(mirrored.position, expected, atol=4e-3)
+        compared += 1
     assume(compared >= 10)
