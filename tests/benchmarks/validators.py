@@ -22,7 +22,7 @@ RESULTS = Path(__file__).parents[2] / "recipes" / "results"
 COMMANDS = {
     "robovet": ["doctor", "DATASET"],
     "rdq": ["check", "DATASET", "--fail-under", "100"],
-    "lerobot-doctor": ["check", "DATASET", "--ci", "--fail-on", "fail"],
+    "lerobot-doctor": ["check", "DATASET", "--fail-on", "fail"],
 }
 SAID = re.compile(r"\d+ (?:fail|pass)|Score|WARN|ERROR|FAIL|^\s*- |CLEAN", re.I)
 
