@@ -63,7 +63,8 @@ def run_script(script: Path, arguments: list[str], folder: Path, log: Path) -> i
     arguments = str(script), arguments, folder, log
     process = multiprocessing.get_context("spawn").Process(target=_run_here, args=arguments)
     process.start()
-    process.join()
+    while process.exitcode is None:  # join alone may miss it where another thread starts a process
+        process.join()
     return process.exitcode
 
 

@@ -13,10 +13,8 @@ cell needs and whose run is not there is trained first. A killed run loses at mo
 yet; the same command goes on.
 """
 
-import multiprocessing
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -84,17 +82,13 @@ def has_run(name: str, config: Config) -> bool:
 
 
 def launch_local(cells: list[Cell], config: Config) -> Iterator[tuple[Cell, str | None]]:
-    """Every cell with its message, in the order in which they end; all processes end with this one."""
-    from dynmap_rl.runs import start_worker
-
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(config.workers, context, start_worker) as pool:
+    """Every cell with its message, in the order in which they end; each is a process of its own, which ends with this
+    one."""
+    with ThreadPoolExecutor(config.workers) as pool:  # threads that wait for processes
         try:
             running = {pool.submit(run_cell, cell, config, Path.cwd()): cell for cell in cells}
             for future in as_completed(running):
                 yield running[future], future.result()
-        except BrokenProcessPool as error:
-            raise OSError("a process died; the same command goes on") from error
         except BaseException:  # Ctrl-C has reached the cells in flight too; no other begins
             pool.shutdown(cancel_futures=True)
             raise

@@ -250,6 +250,11 @@ CASES = [
         f"{TRAIN} --updates 100 --learning_rate 1e9",
         "run again with a lower learning rate, in another --run",
     ),
+    (
+        nothing,
+        "expert --num_envs 4 --minibatch 120 --epochs 2 --learning_rate 1e9",
+        "the loss is not finite; what was kept before stays; run again with a lower learning rate",
+    ),
 ]
 
 

@@ -115,9 +115,10 @@ class DynmapBatchedEnv(EnvBase):
             if (flags := tensordict.get("_reset", None)) is not None:
                 mask = flags.reshape(n).cpu()
             seeds = tensordict.get("scene_seed", scene_seed)
-        if seeds is not None and tuple(seeds.shape) != (n,):
+        if seeds is not None and (shape := tuple(np.shape(seeds))) != (n,):
             raise ValueError(
-                f"scene_seed must have one seed for each of {n} worlds, not {tuple(seeds.shape)}"
+                f"scene_seed must have one seed for each of {n} worlds, not {shape}; "
+                "a ParallelEnv takes those of its processes as list_of_kwargs"
             )
         for i in mask.nonzero().flatten().tolist():
             seed = int(seeds[i]) if seeds is not None else int(self.rng.integers(2**63))

@@ -132,7 +132,7 @@ def train_ppo(
 def update(
     batch: TensorDictBase, loss_module: ClipPPOLoss, advantage: GAE, optimizer, epochs: int, minibatch: int
 ) -> dict[str, float]:
-    """PPO's epochs of minibatches over one batch ``[N, T]``; ``ValueError`` where the last loss is not finite."""
+    """PPO's epochs of minibatches over one batch ``[N, T]``; ``ValueError`` where a loss is not finite."""
     with torch.no_grad():
         batch = advantage(batch)
     batch = batch.select(
@@ -146,6 +146,8 @@ def update(
             loss.backward()
             norm = torch.nn.utils.clip_grad_norm_(loss_module.parameters(), 0.5)
             optimizer.step()
+    # Weights that are not finite stay so: the last loss tells. Nor is there a first loss to compare with: the critic's
+    # rises with the returns, in a good run fivefold.
     check_loss(loss.item(), norm)
     return {k: losses[k].item() for k in ("loss_objective", "loss_critic", "entropy")}
 

@@ -1,5 +1,6 @@
 """The batched TorchRL environment: its specs, its resets, and its agreement with the Gymnasium ids."""
 
+import re
 from dataclasses import replace
 from functools import partial
 
@@ -194,7 +195,7 @@ def test_worlds_in_processes_of_their_own_are_the_same_worlds():
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*use of fork")
-@pytest.mark.parametrize("processes", [2, 4])
+@pytest.mark.parametrize("processes", [1, 2, 4])
 def test_the_same_trajectories_in_any_number_of_processes(processes):
     seeds, rng = torch.arange(4), np.random.default_rng(0)
     actions = torch.from_numpy(rng.normal(0, 0.005, (10, 4, 3))).float()
@@ -216,9 +217,16 @@ def test_the_same_trajectories_in_any_number_of_processes(processes):
         env.close()
 
 
-def test_every_world_has_its_scene_s_seed():
-    with pytest.raises(ValueError, match="one seed for each of 4 worlds, not \\(2,\\)"):
-        DynmapBatchedEnv(num_envs=4).reset(scene_seed=torch.arange(2))
+@pytest.mark.parametrize("seeds", [torch.arange(2), torch.zeros(2, 2, dtype=torch.int64), [0, 1, 2], 0])
+def test_every_world_has_its_scene_s_seed(seeds):
+    shape = re.escape(str(tuple(np.shape(seeds))))
+    with pytest.raises(ValueError, match=f"one seed for each of 4 worlds, not {shape}; .* as list_of_kwargs"):
+        DynmapBatchedEnv(num_envs=4).reset(scene_seed=seeds)
+
+
+def test_seeds_may_be_a_list():
+    env = DynmapBatchedEnv(num_envs=2)
+    assert torch.equal(env.reset(scene_seed=[3, 4])["state"], seeded(env, [3, 4])["state"])
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Laws that hold in every scene and under any action: 90 random episodes of 120 steps, 10,800 in all, for each task."""
 
+import math
 from dataclasses import asdict
 
 import numpy as np
@@ -13,6 +14,7 @@ from dynmap_rl.envs.world import (
     ACTION_LIMIT,
     CONTROL_DT,
     GRAVITY,
+    SUBSTEPS,
     VELOCITY_LIMIT,
     WORKSPACE_HIGH,
     WORKSPACE_LOW,
@@ -23,7 +25,7 @@ every_task = pytest.mark.parametrize("name", TASKS)
 episodes = given(seed=st.integers(0, 2**32 - 1), wildness=st.floats(0.05, 4))
 many = settings(max_examples=90, deadline=None, derandomize=True)
 
-DEPTH = 0.01  # m, for a moment, when something is hit at full speed
+STANDS = 0.001  # rad, a larger tilt is a block that rocks
 EDGE = ACCELERATION_LIMIT * CONTROL_DT**2 / 8 + 1e-6  # the last braking step need not be a whole one
 
 
@@ -49,20 +51,35 @@ def test_all_is_finite_and_the_cart_within_its_limits(name, seed, wildness):
         assert (world.position[:3] <= WORKSPACE_HIGH + EDGE).all()
 
 
+def top_speeds(world: World) -> tuple[float, float]:
+    """Of the fastest points of cart and block (m/s)."""
+    s, v = world.scene, world.velocity
+    cart, block = math.hypot(s.cart_width, s.cart_height) / 2, math.hypot(s.block_width, s.block_height) / 2
+    return math.hypot(*v[:2]) + abs(v[2]) * cart, math.hypot(*v[3:5]) + abs(v[5]) * block
+
+
 @every_task
 @many
 @episodes
 def test_the_block_does_not_sink_into_what_it_touches(name, seed, wildness):
-    """But where the cart, which nothing stops, presses it against something else, as deep as it is pressed."""
+    """But as deep as it moves in a substep of 1 ms, of which the solver takes back a quarter in a control step; and
+    where the cart, which nothing stops, presses it against something else, as far as the cart goes."""
     world, rng = make_world(name, seed)
     [block] = world.block.shapes
-    depths = []
+    left = world.space.collision_bias**CONTROL_DT
+    sunk, depths, before = 0.0, [], top_speeds(world)
     for _ in range(120):
         world.step(wild(rng, wildness))
+        after = top_speeds(world)
+        cart, own = np.maximum(before, after)
+        before = after
+        hit = (cart + own + GRAVITY * CONTROL_DT) * CONTROL_DT / SUBSTEPS
         touched = world.space.shape_query(block)
-        if len({info.shape for info in touched}) == 1:
-            depths += [-point.distance for info in touched for point in info.contact_point_set.points]
-    assert max(depths, default=0) < DEPTH
+        pressed = len({info.shape for info in touched}) > 1
+        sunk = max(sunk, hit) + cart * CONTROL_DT if pressed else max(left * sunk, hit)
+        found = [-point.distance for info in touched for point in info.contact_point_set.points]
+        assert max(found, default=0) < world.space.collision_slop + sunk
+        depths += [] if pressed else found
     assert np.median(depths) < 3 * world.space.collision_slop
 
 
@@ -95,20 +112,26 @@ def test_what_has_come_to_rest_stays_at_rest(name, seed, wildness):
 @many
 @given(seed=st.integers(0, 2**32 - 1), wildness=st.floats(0.02, 0.15))
 def test_the_mirrored_world_moves_mirrored(name, seed, wildness):
-    """With its walls, as long as the block stands: what tips is chaotic. Contacts are solved in another order, which
-    grows to a few millimetres at most."""
+    """With its walls: wherever the block stands, until it is dropped.
+
+    Contacts are solved in another order, and a block that rocks lands at another moment. One that stands in both worlds
+    differs by two tilts and what it may sink in, at its corners, 0.1 m from its centre.
+    """
     world, rng = make_world(name, seed)
     fields = asdict(world.scene)
     places = {key: 1 - value for key, value in fields.items() if key.endswith("_x")}
     mirrored = get_task(name).make_world(world.scene.replace(**places, block_shift=-fields["block_shift"]))
     mirror, compared = np.array([-1, 1, -1]), 0
+    tolerance = 2 * STANDS * 0.1 + world.space.collision_slop
     for _ in range(60):
         action = wild(rng, wildness)
         world.step(action)
         mirrored.step(action * mirror)
-        if world.dropped or abs(world.block_in_cart[2]) > 0.002:
+        if world.dropped or mirrored.dropped:
             break
         expected = world.position * np.tile(mirror, 2) + [1, 0, 0, 1, 0, 0]
-        np.testing.assert_allclose(mirrored.position, expected, atol=4e-3)
-        compared += 1
-    assume(compared >= 10)
+        np.testing.assert_allclose(mirrored.position[:3], expected[:3], atol=1e-12)
+        if max(abs(world.block_in_cart[2]), abs(mirrored.block_in_cart[2])) < STANDS:
+            np.testing.assert_allclose(mirrored.position[3:5], expected[3:5], rtol=0, atol=tolerance)
+            compared += 1
+    assume(compared >= 20)
