@@ -4,9 +4,11 @@
     python recipes/add_dynamics.py --dataset user/name --track --output datasets/name
 
 `dynamics.position`, `.velocity` and `.acceleration` are what the world models of recipes/decoupled.py and
-recipes/joint.py are supervised on. The dataset stays as it is; the new one appears when it is whole.
+recipes/joint.py are supervised on. The dataset stays as it is; the new one appears when it is whole. A page in
+runs/add_dynamics, `report.html`, shows them.
 """
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -46,6 +48,7 @@ class Config:
 
 def main(config: Config) -> None:
     from dynmap_rl.data import add_dynamics, parse_entries
+    from dynmap_rl.evaluation import write_dataset_page
 
     if not config.dataset or not config.output:
         raise ValueError("name the dataset with --dataset and the new folder with --output")
@@ -59,9 +62,14 @@ def main(config: Config) -> None:
     }
     differences = add_dynamics(**settings)
     print(f"done: {config.output}")
+    lines = []
     for quantity, difference in differences.items():
         entries = ", ".join(f"{value:.3g}" for value in difference)
-        print(f"  {quantity} differs from the column that was there by {entries} on average")
+        lines.append(f"  {quantity} differs from the column that was there by {entries} on average")
+        print(lines[-1])
+    folder = Path("runs/add_dynamics") / config.output.name
+    write_dataset_page(folder, config.output, dataclasses.asdict(config), "\n".join(lines))
+    print(f"written: {folder / 'report.html'}")
 
 
 if __name__ == "__main__":

@@ -4,9 +4,11 @@
     python recipes/collect.py --kind exploration               # other places than the goal, noise, drops
     python recipes/collect.py --push_to_hub user/name
 
-The experts ship with the package. The same command goes on where it was stopped, or says that it is done.
+The experts ship with the package. The same command goes on where it was stopped, or says that it is done. A page in
+runs/collect, `report.html`, shows what was recorded.
 """
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,6 +38,7 @@ class Config:
 def main(config: Config) -> None:
     from dynmap_rl.data import META, push_dataset, record_dataset
     from dynmap_rl.envs.tasks import get_task
+    from dynmap_rl.evaluation import write_dataset_page
 
     suffix = "" if config.kind == "demonstrations" else f"_{config.kind}"
     output = config.output or Path("datasets") / f"{get_task(config.task).name}{suffix}"
@@ -43,6 +46,9 @@ def main(config: Config) -> None:
     sizes = config.episodes, config.eval_episodes
     record_dataset(output, config.task, config.kind, *sizes, config.workers, config.expert)
     print(f"{'complete already' if complete else 'done'}: {output}")
+    if not (page := Path("runs/collect") / output.name / "report.html").exists() or not complete:
+        write_dataset_page(page.parent, output, dataclasses.asdict(config))
+        print(f"written: {page}")
     if config.push_to_hub:
         push_dataset(output, config.push_to_hub)
         print(f"pushed: {config.push_to_hub}")

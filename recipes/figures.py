@@ -5,9 +5,11 @@
 
 Fig. 2 to 4 show demonstrations, Fig. 6 and 9 what a world model of task 1 predicts on tasks 1 and 3, Fig. 7 policy
 losses, Fig. 8 closed-loop episodes; Fig. 1 and 5 are diagrams. ``distributions`` shows how the angles and angular
-velocities of the tasks are distributed, with their ranges as JSON. What a missing run leaves out is said.
+velocities of the tasks are distributed, with their ranges as JSON. What a missing run leaves out is said. All of them are
+on one page, `report.html`.
 """
 
+import dataclasses
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -40,6 +42,8 @@ class Config:
 
 
 def main(config: Config) -> None:
+    from dynmap_rl.evaluation import write_html
+
     names = [name.strip() for name in config.only.split(",")] if config.only else list(FIGURES)
     if unknown := [name for name in names if name not in FIGURES]:
         raise ValueError(f"--only: no figure {', '.join(unknown)}; choose from {', '.join(FIGURES)}")
@@ -47,10 +51,14 @@ def main(config: Config) -> None:
     missing = []
     for name in names:
         try:
-            FIGURES[name](config, datasets)
+            FIGURES[name][0](config, datasets)
             print(f"written: {config.output / name}.png", flush=True)
         except ValueError as error:
             missing.append(f"{name}: {error}")
+    if len(missing) < len(names):
+        captions = {f"{name}.png": caption for name, (_, caption) in FIGURES.items()}
+        said, settings = "\n".join(missing) or "All are there.", dataclasses.asdict(config)
+        write_html(config.output, "The paper's figures", said, command_line(), settings, captions)
     if missing:
         raise ValueError("; ".join(missing))
 
@@ -174,15 +182,15 @@ def draw_fig8(config: Config, datasets: dict) -> None:
     plot_position_errors(panels, config.output / "fig8.png")
 
 
-FIGURES = {
-    "fig2": draw_fig2,
-    "fig3": draw_fig3,
-    "fig4": draw_fig4,
-    "fig6": partial(draw_prediction, task=ONE, name="fig6"),
-    "fig7": draw_fig7,
-    "fig8": draw_fig8,
-    "fig9": partial(draw_prediction, task=THREE, name="fig9"),
-    "distributions": draw_distributions,
+FIGURES = {  # with their captions
+    "fig2": (draw_fig2, "Fig. 2: a demonstration over time"),
+    "fig3": (draw_fig3, "Fig. 3: demonstrations of the tasks"),
+    "fig4": (draw_fig4, "Fig. 4: start states"),
+    "fig6": (partial(draw_prediction, task=ONE, name="fig6"), "Fig. 6: predictions on task 1"),
+    "fig7": (draw_fig7, "Fig. 7: policy losses"),
+    "fig8": (draw_fig8, "Fig. 8: position errors in closed loop"),
+    "fig9": (partial(draw_prediction, task=THREE, name="fig9"), "Fig. 9: predictions on task 3"),
+    "distributions": (draw_distributions, "Angles and angular velocities"),
 }
 
 

@@ -11,9 +11,10 @@ and on without frames, beside the simulator. B shows the dynamics of cart or blo
 pauses, ESC ends.
 
 With --record, every successful episode that you alone drove is kept at once; at the end they become a LeRobot dataset with
-dynamics columns, and the next session adds to it.
+dynamics columns, shown on a page in runs/play, and the next session adds to it.
 """
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -55,6 +56,7 @@ def main(config: Config) -> None:
     from dynmap_rl.data.human import list_shards, next_scene, open_folder, publish_episodes
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.envs.world import CONTROL_DT, EPISODE_STEPS
+    from dynmap_rl.evaluation import write_dataset_page
     from dynmap_rl.modules import find_run, load_actor, task_of_run
     from dynmap_rl.play import PlayWindow, Session
 
@@ -90,6 +92,8 @@ def main(config: Config) -> None:
         count = len(list_shards(config.record, task)) if config.record else 0
         if count > max(kept, 1) or (count > 1 and not config.record.exists()):
             print(f"{count} episodes: {publish_episodes(config.record, task)}")
+            folder = Path("runs/play") / config.record.name
+            write_dataset_page(folder, config.record, dataclasses.asdict(config))
     if config.gif:
         save_film(frames, config.gif)
     if config.push_to_hub:

@@ -10,7 +10,7 @@
 A cell is a run of another recipe; its result is a JSON in ``results``. Cells whose result is there are skipped, so that a
 grid of your own needs a folder of its own (``--results runs/results``). World models are trained once and reused; one that a
 cell needs and whose run is not there is trained first. A killed run loses at most what its cells in flight have not saved
-yet; the same command goes on.
+yet; the same command goes on. A page in the folder of the runs, `report.html`, shows the tables so far.
 """
 
 from collections.abc import Iterator
@@ -20,7 +20,13 @@ from pathlib import Path
 from types import SimpleNamespace
 
 from dynmap_rl.cells import TABLES, Cell, list_cells
-from dynmap_rl.commands import check_at_least_one, refuse, replace_defaults, run_recipe, run_script
+from dynmap_rl.commands import (
+    check_at_least_one,
+    refuse,
+    replace_defaults,
+    run_recipe,
+    run_script,
+)
 
 RECIPES = Path(__file__).parent
 SMOKE = Path("runs/tables_smoke")
@@ -175,6 +181,7 @@ def main(config: Config) -> None:
         return print(
             f"nothing to do: {len(cells)} cells are in {config.results}; for a grid of your own name --results"
         )
+    from dynmap_rl.evaluation.tables import write_tables_page
     from dynmap_rl.settings import find_or_record
 
     for task in {cell.task for cell in sources + todo}:  # here, so that cells do not record at the same time
@@ -183,6 +190,7 @@ def main(config: Config) -> None:
     ready = [cell for cell in todo if cell.needs and has_run(cell.needs, config)]
     missing = [cell.name for cell in todo if cell.needs and cell not in ready]
     failed += launch(ready, config) + [f"{name} waits for its world model" for name in missing]
+    write_tables_page(config.runs, config.results, vars(config))
     if failed:
         raise ValueError("; ".join(failed))
 

@@ -1,5 +1,6 @@
 """Closed-loop rollouts, DR / PE / SR, statistics and figures."""
 
+from .dataset_page import write_dataset_page
 from .held_out import policy_errors, write_held_out
 from .html import write_html
 from .imagination import open_loop_errors
@@ -28,6 +29,7 @@ __all__ = [
     "summarize",
     "summarize_seeds",
     "wilson",
+    "write_dataset_page",
     "write_held_out",
     "write_html",
     "write_report",

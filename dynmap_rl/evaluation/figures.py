@@ -138,16 +138,15 @@ def plot_distributions(dynamics: dict[str, TensorDictBase], path: Path) -> dict[
 
 
 def save_gif(pixels: torch.Tensor, path: Path, columns: int = 4, scale: int = 3) -> None:
-    """Frames ``[E, T, 3, 64, 64]`` of E episodes as one animation in real time."""
-    frames = pixels.permute(1, 0, 3, 4, 2).numpy()  # (T, E, 64, 64, 3)
-    rows = -(-frames.shape[1] // columns)
-    blank = np.full((frames.shape[0], rows * columns - frames.shape[1], 64, 64, 3), 255, np.uint8)
-    grid = np.concatenate([frames, blank], 1).reshape(len(frames), rows, columns, 64, 64, 3)
-    grid = grid.swapaxes(2, 3).reshape(len(frames), rows * 64, columns * 64, 3)
-    images = [
-        Image.fromarray(f).resize((columns * 64 * scale, rows * 64 * scale), Image.Resampling.NEAREST)
-        for f in grid
-    ]
+    """Frames ``[E, T, 3, H, W]`` of E episodes as one animation, 20 steps a second."""
+    episodes, steps, _, height, width = pixels.shape
+    rows = -(-episodes // columns)
+    frames = pixels.permute(1, 0, 3, 4, 2).numpy()  # (T, E, H, W, 3)
+    blank = np.full((steps, rows * columns - episodes, height, width, 3), 255, np.uint8)
+    grid = np.concatenate([frames, blank], 1).reshape(steps, rows, columns, height, width, 3)
+    grid = grid.swapaxes(2, 3).reshape(steps, rows * height, columns * width, 3)
+    size = columns * width * scale, rows * height * scale
+    images = [Image.fromarray(f).resize(size, Image.Resampling.NEAREST) for f in grid]
     path.parent.mkdir(parents=True, exist_ok=True)
     images[0].save(path, save_all=True, append_images=images[1:], duration=50, loop=0, optimize=True)
 

@@ -21,10 +21,19 @@ PICTURES = {  # in this order
     "figures/dynamics.png": "The block's dynamics along a held-out episode, true and predicted",
     "open_loop.png": "Open-loop prediction: its error against the time without frames",
     "probes.png": "How much of the dynamics a linear map reads out of each state",
+    "episodes.gif": "Some of the episodes",
+    "dynamics.png": "The dynamics of the first episode",
 }
 
 
-def write_html(folder: Path, title: str, row: str, command: str = "", settings: dict | None = None) -> Path:
+def write_html(
+    folder: Path,
+    title: str,
+    row: str,
+    command: str = "",
+    settings: dict | None = None,
+    pictures: dict[str, str] = PICTURES,
+) -> Path:
     """Write ``report.html``: the table row, animations and figures, curves, settings, the command.
 
     Args:
@@ -33,9 +42,10 @@ def write_html(folder: Path, title: str, row: str, command: str = "", settings: 
         row: the result, as text.
         command: that made it.
         settings: those of ``config.json`` in the folder unless others are given.
+        pictures: files in the folder, with their captions; those that are not there are left out.
     """
     parts = [f"<h1>{html.escape(title)}</h1>", f"<pre>{html.escape(row.strip())}</pre>"]
-    for name, caption in PICTURES.items():
+    for name, caption in pictures.items():
         if (folder / name).exists():
             data = base64.b64encode((folder / name).read_bytes()).decode()
             parts += [

@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from dynmap_rl.commands import command_line
 from dynmap_rl.runs import read_json
 
+from .html import write_html
 from .paper import METRICS, TABLES, paper_numbers
 from .report import markdown_row, result_rows
 from .statistics import shared_interval, summarize
@@ -107,6 +109,12 @@ def markdown_tables(results: Path) -> str:
         for column in columns:
             parts.append(f"Table {table}, {', '.join(column[1:])}\n\n{markdown_table(results, column)}")
     return "\n\n".join(parts)
+
+
+def write_tables_page(folder: Path, results: Path, settings: dict) -> None:
+    """``report.html`` in a folder: the tables so far, the settings of the recipe that ran them, and its command."""
+    page = write_html(folder, "Tables I to III", markdown_tables(results), command_line(), settings)
+    print(f"written: {page}")
 
 
 def print_tables(results: Path, form: str) -> None:

@@ -1,5 +1,6 @@
 """The add_dynamics recipe: the columns, their statistics, and a new folder that is whole or absent."""
 
+import contextlib
 import json
 import os
 import subprocess
@@ -26,6 +27,13 @@ def make_pair(folder, videos):
     source, output = make_foreign(folder / "source", LENGTHS, videos), folder / "output"
     main(Config(dataset=str(source), output=output, columns="0,1,2", angles="2"))
     return source, output
+
+
+@pytest.fixture(scope="module", autouse=True)
+def folder_of_runs(tmp_path_factory):
+    """Where the recipe leaves its pages."""
+    with contextlib.chdir(tmp_path_factory.mktemp("runs")):
+        yield Path.cwd() / "runs/add_dynamics"
 
 
 @pytest.fixture(scope="module")
@@ -73,6 +81,12 @@ def test_lerobot_reads_it_and_nothing_else_has_changed(pair):
         assert all(
             torch.equal(item[k], old[k]) if torch.is_tensor(old[k]) else item[k] == old[k] for k in old
         )
+
+
+def test_a_page_shows_the_new_columns(folder_of_runs, videos):
+    page = (folder_of_runs / "output/report.html").read_text()
+    assert f"{sum(LENGTHS)} frames" in page and "dynamics.acceleration angle" in page
+    assert page.count("data:image/") == 2, "frames of the videos, and the columns over time"
 
 
 def test_the_hub_reads_the_tables(pair):

@@ -26,7 +26,10 @@ def test_records_where_it_says_and_then_says_that_it_is_complete(
     monkeypatch.chdir(tmp_path)
     config = Config(task=task, kind=kind, episodes=1, eval_episodes=1, workers=1)
     main(config)
-    assert capsys.readouterr().out == f"done: datasets/{name}\n"
+    page = Path(f"runs/collect/{name}/report.html")
+    assert capsys.readouterr().out == f"done: datasets/{name}\nwritten: {page}\n"
+    assert "2 episodes (train 0:1, eval 1:2), 240 frames, 20 a second" in page.read_text()
+    assert page.read_text().count("data:image/") == 2
     assert load_dataset(f"datasets/{name}").shape == (2, 120)
     assert [p.name for p in (tmp_path / "datasets").iterdir()] == [name]
     main(config)

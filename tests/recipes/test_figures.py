@@ -55,6 +55,8 @@ def test_draws_every_figure(runs, recordings, few_episodes, tmp_path, capsys):
     main(Config(runs=runs, output=tmp_path, datasets=datasets))
     names = {"distributions", "fig7_training", *(f"fig{number}" for number in (2, 3, 4, 6, 7, 8, 9))}
     assert {path.stem for path in tmp_path.glob("*.png")} == names
+    page = (tmp_path / "report.html").read_text()
+    assert page.count("data:image/png") == 8 and "Fig. 7: policy losses" in page and "All are there." in page
     text = capsys.readouterr().out
     for name in names:
         assert is_drawn(tmp_path / f"{name}.png"), name
@@ -100,7 +102,9 @@ def test_a_missing_run_is_named_after_the_other_figures(recording, tmp_path):
     first = "balance_reaching_decoupled_none_feedforward"
     said = f"fig8: no finished run runs/tables/{first}; run {tables} {first} (1 more: without --only)"
     assert said in result.stderr
-    assert [path.name for path in (tmp_path / "runs/figures").iterdir()] == ["fig4.png"]
+    folder = tmp_path / "runs/figures"
+    assert sorted(path.name for path in folder.iterdir()) == ["fig4.png", "report.html"]
+    assert "fig6: no finished run" in (folder / "report.html").read_text()
 
 
 def test_a_dataset_that_a_figure_lacks_is_named(runs, recording, tmp_path):

@@ -126,6 +126,8 @@ def test_what_a_person_drove_becomes_a_dataset(tmp_path, monkeypatch):
     assert pushed == [(Path("mine"), "someone/mine")] and "pushed: someone/mine" in result.stdout
     assert "kept: 2 episodes in mine.parts" in result.stdout and "2 episodes: mine" in result.stdout
     assert load_dataset(tmp_path / "mine").shape == (2, 120)
+    page = (tmp_path / "runs/play/mine/report.html").read_text()
+    assert "2 episodes (train 0:1, eval 1:2)" in page and page.count("data:image/") == 2
     meta = load_meta(tmp_path / "mine")
     assert (meta["kind"], meta["splits"]) == ("human", {"train": [0, 1], "eval": [1, 2]})
     assert all(row["success"] for row in meta["episodes"])

@@ -75,19 +75,28 @@ def test_a_table_is_chosen_alone(tmp_path):
     assert one == {"balance_reaching_joint_none_recurrent"}
 
 
+def done(result):
+    """The cells that the recipe says it has run, and then where its page is."""
+    *cells, page = result.stdout.splitlines()
+    assert page == "written: runs/tables_smoke/report.html"
+    return [line.removeprefix("done: ") for line in cells]
+
+
 def test_cells_run_once_and_are_printed_beside_the_paper(recordings, tmp_path):
     commands.place_recordings(tmp_path, recordings, *TASKS)
     smoke = "--smoke", "--only", "joint_none"
     result = run(tmp_path, *smoke)
     assert result.returncode == 0, result.stderr
     names = [f"{task}_joint_none_recurrent" for task in TASKS]
-    assert [line.removeprefix("done: ") for line in result.stdout.splitlines()] == names
+    assert done(result) == names
+    page = (tmp_path / "runs/tables_smoke/report.html").read_text()
+    assert "Table III, joint, recurrent" in page and "| Only-RGB | 46 (1.6) | " in page
     assert sorted(p.stem for p in (tmp_path / "results").iterdir()) == sorted(names)
 
     times = {path: path.stat().st_mtime_ns for path in (tmp_path / "results").iterdir()}
     (tmp_path / "results/bin_dropping_joint_none_recurrent.json").unlink()
     again = run(tmp_path, *smoke)
-    assert again.stdout == "done: bin_dropping_joint_none_recurrent\n"
+    assert done(again) == ["bin_dropping_joint_none_recurrent"]
     assert all(path.stat().st_mtime_ns == time for path, time in times.items() if "bin" not in path.name)
 
     assert run(tmp_path, *smoke).stdout.startswith("nothing to do: 3 cells are in results")
@@ -95,7 +104,7 @@ def test_cells_run_once_and_are_printed_beside_the_paper(recordings, tmp_path):
     shutil.rmtree(tmp_path / "runs")  # as in a fresh clone, where results are but no runs
     (tmp_path / "results/bin_dropping_joint_none_recurrent.json").unlink()
     fresh = run(tmp_path, "--smoke", "--only", "bin_dropping_joint_none_recurrent")
-    assert fresh.stdout.splitlines() == [f"done: {names[0]}", f"done: {names[2]}"], fresh.stderr
+    assert done(fresh) == [names[0], names[2]], fresh.stderr
     assert all(path.stat().st_mtime_ns == time for path, time in times.items() if "bin" not in path.name)
 
     rows = json.loads(run(tmp_path, "--print", "json").stdout)
@@ -121,7 +130,7 @@ def test_ray_runs_the_same_cells(recordings, tmp_path, monkeypatch):
     command += ["--launcher", "ray", "--cpus", "1"]
     result = subprocess.run(command, cwd=tmp_path, env=os.environ, capture_output=True, text=True)
     names = ["balance_reaching_joint_none_recurrent", "balance_reaching_obstacle_joint_none_recurrent"]
-    assert [line.removeprefix("done: ") for line in result.stdout.splitlines()] == names, result.stderr
+    assert done(result) == names, result.stderr
     assert sorted(p.stem for p in (tmp_path / "results").iterdir()) == sorted(names)
     assert result.returncode == 2
     assert "bin_dropping_joint_none_recurrent failed; see runs/tables_smoke/" in result.stderr
@@ -162,7 +171,7 @@ def test_what_stops_the_command_stops_its_cells_and_begins_no_other(recordings, 
     with FileLock(first / ".lock", timeout=60):
         assert not (first / "eval.json").exists() and not second.exists()
     again = commands.run(tmp_path, "tables", *smoke, first.name)
-    assert again.stdout == f"done: {first.name}\n", again.stderr
+    assert done(again) == [first.name], again.stderr
 
 
 @pytest.mark.parametrize(
