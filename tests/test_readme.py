@@ -259,6 +259,16 @@ def test_errors_on_the_foreign_dataset_are_those_of_the_results():
     assert f"({ours['angle']:.1f} rad; the constant {constant['angle']:.2f};" in text
     assert facts["command"] in README
 
+    facts = json.loads((ROOT / "recipes/results/so100_demo.json").read_text())
+    ours, constant = facts["held_out"]["position"], facts["spread"]["position"]
+    shown = "shoulder_pan", "shoulder_lift", "gripper"
+    (a, b, c), (d, e, f) = ([values[joint] for joint in shown] for values in (ours, constant))
+    assert (
+        f"are off by {a:.2f}, {b:.2f} and {c:.2f} (the best constant: {d:.2f}, {e:.2f} and {f:.2f})" in text
+    )
+    assert all(ours[joint] > constant[joint] for joint in ours.keys() - shown)
+    assert facts["command"] in README
+
 
 def test_what_a_world_model_knows_is_that_of_the_results():
     facts = json.loads((ROOT / "recipes/results/probe.json").read_text())

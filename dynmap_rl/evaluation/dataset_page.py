@@ -46,11 +46,11 @@ def write_dataset_page(folder: Path, dataset: str | Path, settings: dict, said: 
 def _ranges(root: Path, info: dict, quantities: list[str]) -> list[str]:
     """A line for each entry of the dynamics: smallest, mean and largest."""
     stats = read_metadata(root / "meta" / "stats.json")
-    lines = [f"{'':32} {'min':>10} {'mean':>10} {'max':>10}"]
+    lines = [f"{'':40} {'min':>10} {'mean':>10} {'max':>10}"]
     for column in (f"dynamics.{quantity}" for quantity in quantities):
         values = (np.ravel(stats[column][name]) for name in ("min", "mean", "max"))
         for entry, *numbers in zip(entry_names(info, column), *values, strict=True):
-            lines.append(f"{f'{column} {entry}':32} " + " ".join(f"{number:10.4g}" for number in numbers))
+            lines.append(f"{f'{column} {entry}':40} " + " ".join(f"{number:10.4g}" for number in numbers))
     return lines
 
 

@@ -105,7 +105,7 @@ def batch(num_envs: int = 64, steps: int = 60) -> dict:
 
     def ours():
         env = DynmapBatchedEnv(num_envs=num_envs, seed=0)
-        td, tensors = env.reset(), torch.from_numpy(actions)
+        td, tensors = env.reset(scene_seed=torch.arange(num_envs)), torch.from_numpy(actions)
 
         def run():
             state = td
