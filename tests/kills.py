@@ -5,7 +5,8 @@
 
 Every process of the recipe gets SIGKILL. What must be the same in the end: every number of a dataset and its metadata,
 every weight, every metric but the wall-clock time, every row of every cell. And nothing that was finished may be made
-again: shards of a dataset, policies, cells, saved updates. Ends with an error where anything differs.
+again: shards of a dataset, policies, cells, saved updates. Ends with an error where anything differs; otherwise writes
+the counts into ``recipes/results/kills.json``, where recipes that were not asked for stay as they are.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ from pathlib import Path
 import torch
 from safetensors.torch import load_file
 
+from dynmap_rl.runs import read_json, write_json
+
 RECIPES = Path(__file__).parents[1] / "recipes"
 SMALL = "--num_envs 4 --iterations 12 --epochs 1 --minibatch 240 --checkpoint_every 2 --eval_episodes 4 --final_episodes 4"
 COMMANDS = {
@@ -33,6 +36,7 @@ COMMANDS = {
     "decoupled": "--smoke --seeds 0,1 --updates 600",  # saved every 250
     "tables": "--smoke --only joint_none --results results",
 }
+RESULTS = RECIPES / "results" / "kills.json"
 LEFT_OUT = {"seconds", "command"}  # wall-clock time
 
 
@@ -105,7 +109,7 @@ def plain(value):
     return [plain(item) for item in value] if isinstance(value, list) else value
 
 
-def torment(recipe: str, kills: int, folder: Path) -> None:
+def torment(recipe: str, kills: int, folder: Path) -> dict[str, int | str]:
     whole = folder / f"{recipe}_whole"
     whole.mkdir()
     began = time.perf_counter()
@@ -127,8 +131,9 @@ def torment(recipe: str, kills: int, folder: Path) -> None:
         differing = sorted(name for name in {*expected, *found} if expected.get(name) != found.get(name))
         if differing:
             raise SystemExit(f"{recipe}: after {count} kills these differ: {', '.join(differing)}")
-    kills = f"{count} kills of {runs} runs, {midway} of them after a training was saved and before it ended"
-    print(f"{recipe}: {kills}; {len(expected)} files the same", flush=True)
+    counts = {"kills": count, "runs": runs, "after_a_saved_state": midway, "files_the_same": len(expected)}
+    print(f"{recipe}: {counts}", flush=True)
+    return counts | {"arguments": COMMANDS[recipe]}
 
 
 def main() -> None:
@@ -140,7 +145,8 @@ def main() -> None:
     random.seed(arguments.seed)
     with tempfile.TemporaryDirectory() as folder:
         for recipe in arguments.recipes:
-            torment(recipe, arguments.kills, Path(folder))
+            found = torment(recipe, arguments.kills, Path(folder))
+            write_json(RESULTS, (read_json(RESULTS) if RESULTS.exists() else {}) | {recipe: found})
 
 
 if __name__ == "__main__":

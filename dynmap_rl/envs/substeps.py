@@ -1,7 +1,7 @@
 """The substeps of a control step: 1 ms each, while the cart's velocity goes linearly from one value to another.
 
-Compiled, LLVM calls PyMunk's own C functions without the interpreter in between, which is about five times faster than
-the plain loop and gives the same bits.
+Compiled, LLVM calls PyMunk's own C functions without the interpreter in between, for one world or for many, which is about
+five times faster than the plain loop and gives the same bits.
 """
 
 from __future__ import annotations
@@ -10,34 +10,51 @@ import ctypes
 import functools
 import platform
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
+import numpy as np
 import pymunk
 
-Velocity = tuple[float, float, float]  # m/s, m/s, rad/s
-Run = Callable[[pymunk.Space, pymunk.Body, Velocity, Velocity, int, float], None]
+Bodies = tuple[pymunk.Space, pymunk.Body, pymunk.Body]  # a space, its cart and its block
+Run = Callable[[Sequence[Bodies], np.ndarray, np.ndarray, int, float], np.ndarray]
 
 
 def run_plain(
-    space: pymunk.Space, cart: pymunk.Body, before: Velocity, after: Velocity, steps: int, dt: float
-) -> None:
-    """Step the space ``steps`` times by ``dt`` (s); in each the cart moves at the velocity of the substep's middle."""
-    for i in range(steps):
-        _step(space, cart, before, after, (i + 0.5) / steps, dt)
+    worlds: Sequence[Bodies], before: np.ndarray, after: np.ndarray, steps: int, dt: float
+) -> np.ndarray:
+    """Step every space ``steps`` times by ``dt`` (s); in each the cart moves at the velocity of the substep's middle.
+
+    Args:
+        before, after: the cart's velocity at the start and at the end, float64 ``[N, 3]`` (m/s, m/s, rad/s).
+
+    Returns:
+        What :func:`read_bodies` then says of each world, ``[N, 12]``.
+    """
+    for (space, cart, _), b, a in zip(worlds, before.tolist(), after.tolist(), strict=True):
+        for i in range(steps):
+            middle = (i + 0.5) / steps
+            _steer(cart, *(x + (y - x) * middle for x, y in zip(b, a, strict=True)))
+            space.step(dt)
+        _steer(cart, *a)
+    return np.array([read_bodies(cart, block) for _, cart, block in worlds])
 
 
-def _step(space, cart, before, after, middle: float, dt: float) -> None:
-    x, y, angular = (b + (a - b) * middle for b, a in zip(before, after, strict=True))
+def _steer(cart: pymunk.Body, x: float, y: float, angular: float) -> None:
     cart.velocity = (x, y)
     cart.angular_velocity = angular
-    space.step(dt)
+
+
+def read_bodies(*bodies: pymunk.Body) -> list[float]:
+    """Positions x, y, angle of each, then their velocities."""
+    positions = [value for body in bodies for value in (*body.position, body.angle)]
+    return positions + [value for body in bodies for value in (*body.velocity, body.angular_velocity)]
 
 
 @functools.cache
 def choose_run() -> Run:
     """The compiled form of :func:`run_plain`, or that itself where it cannot be compiled."""
     machine = platform.machine().lower()
-    # Here a C vector is passed as its two numbers.
+    # Here a C vector is passed, and returned, as its two numbers.
     known = sys.platform in ("linux", "darwin") and machine in ("x86_64", "arm64", "aarch64")
     try:
         return _compile() if known else run_plain
@@ -50,39 +67,112 @@ def choose_run() -> Run:
         return run_plain
 
 
-FUNCTIONS = "cpBodySetVelocity", "cpBodySetAngularVelocity", "cpSpaceStep"
-LOOP = """
-declare void @cpBodySetVelocity(i8*, double, double)
-declare void @cpBodySetAngularVelocity(i8*, double)
-declare void @cpSpaceStep(i8*, double)
+FUNCTIONS = (
+    "cpSpaceStep",
+    *(f"cpBodySet{what}" for what in ("Velocity", "AngularVelocity")),
+    *(f"cpBodyGet{what}" for what in ("Position", "Angle", "Velocity", "AngularVelocity")),
+)
+# Worlds are rows of three pointers (space, cart, block), velocities rows of three numbers.
+LOOPS = """
+declare void @cpSpaceStep(ptr, double)
+declare void @cpBodySetVelocity(ptr, double, double)
+declare void @cpBodySetAngularVelocity(ptr, double)
+declare {double, double} @cpBodyGetPosition(ptr)
+declare {double, double} @cpBodyGetVelocity(ptr)
+declare double @cpBodyGetAngle(ptr)
+declare double @cpBodyGetAngularVelocity(ptr)
 
-define double @between(double %b, double %a, double %middle) alwaysinline {
+define ptr @pointer(ptr %worlds, i64 %world, i64 %which) alwaysinline {
+  %at = getelementptr [3 x ptr], ptr %worlds, i64 %world, i64 %which
+  %found = load ptr, ptr %at
+  ret ptr %found
+}
+
+define double @entry(ptr %velocities, i64 %world, i64 %axis) alwaysinline {
+  %at = getelementptr [3 x double], ptr %velocities, i64 %world, i64 %axis
+  %value = load double, ptr %at
+  ret double %value
+}
+
+define double @between(ptr %before, ptr %after, i64 %world, i64 %axis, double %middle) alwaysinline {
+  %b = call double @entry(ptr %before, i64 %world, i64 %axis)
+  %a = call double @entry(ptr %after, i64 %world, i64 %axis)
   %change = fsub double %a, %b
   %part = fmul double %change, %middle
   %value = fadd double %b, %part
   ret double %value
 }
 
-define void @run(i8* %space, i8* %cart, double %bx, double %by, double %bw,
-                 double %ax, double %ay, double %aw, i64 %steps, double %dt) {
+; All substeps but the last, for which the cart has its velocity.
+define void @run(ptr %worlds, ptr %before, ptr %after, i64 %n, i64 %steps, double %dt) {
 start:
   %count = sitofp i64 %steps to double
   %last = sub i64 %steps, 1
+  br label %world
+world:
+  %w = phi i64 [ 0, %start ], [ %next_w, %end_world ]
+  %space = call ptr @pointer(ptr %worlds, i64 %w, i64 0)
+  %cart = call ptr @pointer(ptr %worlds, i64 %w, i64 1)
   br label %substep
 substep:
-  %i = phi i64 [ 0, %start ], [ %next, %substep ]
+  %i = phi i64 [ 0, %world ], [ %next, %step ]
   %number = sitofp i64 %i to double
   %shifted = fadd double %number, 0.5
   %middle = fdiv double %shifted, %count
-  %x = call double @between(double %bx, double %ax, double %middle)
-  %y = call double @between(double %by, double %ay, double %middle)
-  %w = call double @between(double %bw, double %aw, double %middle)
-  call void @cpBodySetVelocity(i8* %cart, double %x, double %y)
-  call void @cpBodySetAngularVelocity(i8* %cart, double %w)
-  call void @cpSpaceStep(i8* %space, double %dt)
+  %x = call double @between(ptr %before, ptr %after, i64 %w, i64 0, double %middle)
+  %y = call double @between(ptr %before, ptr %after, i64 %w, i64 1, double %middle)
+  %turn = call double @between(ptr %before, ptr %after, i64 %w, i64 2, double %middle)
+  call void @cpBodySetVelocity(ptr %cart, double %x, double %y)
+  call void @cpBodySetAngularVelocity(ptr %cart, double %turn)
+  %more = icmp slt i64 %i, %last
+  br i1 %more, label %step, label %end_world
+step:
+  call void @cpSpaceStep(ptr %space, double %dt)
   %next = add i64 %i, 1
-  %more = icmp slt i64 %next, %last
-  br i1 %more, label %substep, label %end
+  br label %substep
+end_world:
+  %next_w = add i64 %w, 1
+  %more_w = icmp slt i64 %next_w, %n
+  br i1 %more_w, label %world, label %end
+end:
+  ret void
+}
+
+define void @read(ptr %body, ptr %out, i64 %first) alwaysinline {
+  %place = call {double, double} @cpBodyGetPosition(ptr %body)
+  %angle = call double @cpBodyGetAngle(ptr %body)
+  %speed = call {double, double} @cpBodyGetVelocity(ptr %body)
+  %turn = call double @cpBodyGetAngularVelocity(ptr %body)
+  %at = getelementptr double, ptr %out, i64 %first
+  %at_angle = getelementptr double, ptr %at, i64 2
+  %at_speed = getelementptr double, ptr %at, i64 6
+  %at_turn = getelementptr double, ptr %at, i64 8
+  store {double, double} %place, ptr %at
+  store double %angle, ptr %at_angle
+  store {double, double} %speed, ptr %at_speed
+  store double %turn, ptr %at_turn
+  ret void
+}
+
+; The cart's velocity after the last substep, and what all bodies then do, in rows of twelve.
+define void @finish(ptr %worlds, ptr %after, ptr %out, i64 %n) {
+start:
+  br label %world
+world:
+  %w = phi i64 [ 0, %start ], [ %next, %world ]
+  %cart = call ptr @pointer(ptr %worlds, i64 %w, i64 1)
+  %block = call ptr @pointer(ptr %worlds, i64 %w, i64 2)
+  %x = call double @entry(ptr %after, i64 %w, i64 0)
+  %y = call double @entry(ptr %after, i64 %w, i64 1)
+  %turn = call double @entry(ptr %after, i64 %w, i64 2)
+  call void @cpBodySetVelocity(ptr %cart, double %x, double %y)
+  call void @cpBodySetAngularVelocity(ptr %cart, double %turn)
+  %row = getelementptr [12 x double], ptr %out, i64 %w
+  call void @read(ptr %cart, ptr %row, i64 0)
+  call void @read(ptr %block, ptr %row, i64 3)
+  %next = add i64 %w, 1
+  %more = icmp slt i64 %next, %n
+  br i1 %more, label %world, label %end
 end:
   ret void
 }
@@ -101,19 +191,33 @@ def _compile() -> Run:
     for name in FUNCTIONS:
         llvm.add_symbol(name, address(ffi.addressof(lib, name)))
     machine = llvm.Target.from_default_triple().create_target_machine(opt=2)
-    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(LOOP), machine)
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(LOOPS), machine)
     engine.finalize_object()
-    signature = [ctypes.c_void_p] * 2 + [ctypes.c_double] * 6 + [ctypes.c_int64, ctypes.c_double]
-    loop = ctypes.CFUNCTYPE(None, *signature)(engine.get_function_address("run"))
+    pointer, whole = ctypes.c_void_p, ctypes.c_int64
+    run, finish = (
+        ctypes.CFUNCTYPE(None, *signature)(engine.get_function_address(name))
+        for name, signature in {
+            "run": (pointer, pointer, pointer, whole, whole, ctypes.c_double),
+            "finish": (pointer, pointer, pointer, whole),
+        }.items()
+    )
 
-    def run_compiled(space, cart, before, after, steps, dt) -> None:
-        # The last substep is PyMunk's own, which does what callbacks asked for: to add and to remove shapes.
-        space._locked = True
+    def run_compiled(worlds, before, after, steps, dt) -> np.ndarray:
+        structs = np.array([(address(s._space), address(c._body), address(b._body)) for s, c, b in worlds])
+        out = np.empty((len(worlds), 12))
+        at, at_before, at_after, at_out = (array.ctypes.data for array in (structs, before, after, out))
+        for space, _, _ in worlds:
+            space._locked = True
         try:
-            loop(address(space._space), address(cart._body), *before, *after, steps, dt)
+            run(at, at_before, at_after, len(worlds), steps, dt)
         finally:
-            space._locked = False
-        _step(space, cart, before, after, (steps - 0.5) / steps, dt)
+            for space, _, _ in worlds:
+                space._locked = False
+        # The last substep is PyMunk's own, which does what callbacks asked for: to add and to remove shapes.
+        for space, _, _ in worlds:
+            space.step(dt)
+        finish(at, at_after, at_out, len(worlds))
+        return out
 
     run_compiled.engine = engine  # owns the machine code
     return run_compiled

@@ -14,7 +14,7 @@ from .gymnasium_env import ACTION_LIMITS
 from .renderer import Renderer
 from .scene import SceneRanges, choose_ranges
 from .tasks import get_task
-from .world import EPISODE_STEPS, World
+from .world import EPISODE_STEPS, World, step_worlds
 
 EVENTS = ("dropped", "touched", "is_success")
 
@@ -128,11 +128,9 @@ class DynmapBatchedEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         actions = tensordict["action"].detach().cpu().numpy()
-        for world, action in zip(self.worlds, actions, strict=True):
-            if self.control == "position":
-                world.step(action)
-            else:
-                world.accelerate(action)
+        if self.control == "acceleration":
+            actions = [world.action_for(a) for world, a in zip(self.worlds, actions, strict=True)]
+        step_worlds(self.worlds, actions)
         reward = self._column(self.task.reward(world) for world in self.worlds)
         return self._observe().update(self._done()).set("reward", reward)
 

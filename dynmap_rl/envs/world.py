@@ -12,7 +12,7 @@ import numpy as np
 import pymunk
 
 from .scene import Point, Scene
-from .substeps import choose_run
+from .substeps import choose_run, read_bodies
 
 GRAVITY = 9.81  # m/s^2
 CONTROL_DT = 0.05  # s, 20 Hz
@@ -74,7 +74,7 @@ class World:
         self._add_walls(walls)
         self.commanded = np.array([scene.cart_x, scene.cart_y, 0.0])
         self.action = np.zeros(3)
-        self.position = self._read_position()
+        self.position = np.array(read_bodies(self.cart, self.block)[:6])
         self.block_in_cart = self._locate_block()
         self.velocity = np.zeros(6)
         self.acceleration = np.zeros(6)
@@ -126,17 +126,16 @@ class World:
         The change of the commanded pose becomes a constant acceleration by the second difference of commanded
         positions, ``(a_t - a_{t-1}) / CONTROL_DT**2``, within the limits (paper, Sec. IV-A).
         """
-        action = self._limit(np.asarray(action, dtype=np.float64))
-        action = action.astype(np.float32).astype(np.float64)  # as stored, so that a replay is bit-exact
-        self._simulate(
-            [a / CONTROL_DT for a in self.action.tolist()], [a / CONTROL_DT for a in action.tolist()]
-        )
+        step_worlds([self], [action])
+
+    def _finish(self, action: np.ndarray, bodies: np.ndarray) -> None:
+        """Note where the simulation of an action has led: positions and velocities, ``[12]``."""
+        velocity = bodies[6:]
         self.action = action
         self.commanded = self.commanded + action
-        velocity = self._read_velocity()
         self.acceleration = (velocity - self.velocity) / CONTROL_DT
         self.velocity = velocity
-        self.position = self._read_position()
+        self.position = bodies[:6]
         self.block_in_cart = self._locate_block()
         self.steps += 1
         self.dropped = self.dropped or self._is_dropped()
@@ -150,28 +149,13 @@ class World:
         """The position-update action that gives this cart acceleration from the present state."""
         return self.action + np.asarray(acceleration, dtype=np.float64) * CONTROL_DT**2
 
-    def _limit(self, action: np.ndarray) -> np.ndarray:
+    def _limit(self, action: np.ndarray) -> list[float]:
         """The action that the cart can execute: limits of acceleration, of speed, and room left to brake."""
+        action = np.asarray(action, dtype=np.float64)
         if action.shape != (3,) or not all(map(math.isfinite, wanted := action.tolist())):
             raise ValueError(f"an action is 3 finite numbers (dX, dY, dTheta), got {action}")
         state = zip(wanted, self.action.tolist(), self.commanded.tolist(), AXES, strict=True)
-        return np.array([_limit_axis(*values) for values in state])
-
-    def _simulate(self, before: list[float], after: list[float]) -> None:
-        """50 steps of 1 ms while the cart's velocity goes linearly from ``before`` to ``after``."""
-        # The velocity in the middle of each substep: the cart's path is then the exact parabola.
-        choose_run()(self.space, self.cart, before, after, SUBSTEPS, CONTROL_DT / SUBSTEPS)
-        x, y, angular = after
-        self.cart.velocity = (x, y)
-        self.cart.angular_velocity = angular
-
-    def _read_position(self) -> np.ndarray:
-        (cx, cy), (bx, by) = self.cart.position, self.block.position
-        return np.array([cx, cy, self.cart.angle, bx, by, self.block.angle])
-
-    def _read_velocity(self) -> np.ndarray:
-        (cx, cy), (bx, by) = self.cart.velocity, self.block.velocity
-        return np.array([cx, cy, self.cart.angular_velocity, bx, by, self.block.angular_velocity])
+        return [_limit_axis(*values) for values in state]
 
     def _locate_block(self) -> tuple[float, float, float]:
         cx, cy, ct, bx, by, bt = self.position.tolist()
@@ -195,6 +179,24 @@ class World:
         """Mean distance of cart and goal over the last 10 steps (m), PE in the paper."""
         last = self.errors[max(1, len(self.errors) - FINAL_STEPS) :] or self.errors
         return sum(last) / len(last)
+
+
+def step_worlds(worlds: Sequence[World], actions: Sequence[np.ndarray]) -> None:
+    """:meth:`World.step` of every world at once, which is faster than one after the other and gives the same bits."""
+    limited = [world._limit(action) for world, action in zip(worlds, actions, strict=True)]
+    limited = np.array(limited, np.float32).astype(np.float64)  # as stored, so that a replay is bit-exact
+    last = np.array([world.action for world in worlds])
+    found = simulate(worlds, last / CONTROL_DT, limited / CONTROL_DT)
+    for world, action, bodies in zip(worlds, limited, found, strict=True):
+        world._finish(action, bodies)
+
+
+def simulate(worlds: Sequence[World], before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """50 steps of 1 ms while the carts' velocities ``[N, 3]`` go linearly from ``before`` to ``after``; positions and
+    velocities of the bodies, ``[N, 12]``."""
+    # The velocity in the middle of each substep: the cart's path is then the exact parabola.
+    bodies = [(world.space, world.cart, world.block) for world in worlds]
+    return choose_run()(bodies, before, after, SUBSTEPS, CONTROL_DT / SUBSTEPS)
 
 
 def _limit_axis(action: float, last: float, commanded: float, axis: tuple[float, ...]) -> float:

@@ -14,7 +14,7 @@ from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor
 
 from dynmap_rl.envs.renderer import Renderer
 from dynmap_rl.envs.tasks import BalanceReaching, get_task
-from dynmap_rl.envs.world import EPISODE_STEPS, World
+from dynmap_rl.envs.world import EPISODE_STEPS, World, step_worlds
 from dynmap_rl.runs import read_json
 from dynmap_rl.weights import load_module
 
@@ -70,8 +70,7 @@ def play(
         yield worlds
         state = np.stack([(states or task).state(world) for world in worlds])
         mean, _ = network(torch.from_numpy(state))
-        for world, acceleration in zip(worlds, mean.numpy(), strict=True):
-            world.accelerate(acceleration)
+        step_worlds(worlds, [world.action_for(a) for world, a in zip(worlds, mean.numpy(), strict=True)])
 
 
 def roll_out(

@@ -124,7 +124,11 @@ def test_push_a_pull_that_is_cut_off_pull_push_again_and_use_offline(recording, 
     shutil.copytree(recording, tmp_path / "dataset")
     printed = run(ONLINE, hub).splitlines()
     assert printed[0] == "complete already: dataset"
-    assert printed[-2:] == ["done: smaller", "pushed: someone/demonstrations"]
+    assert printed[-3:] == [
+        "done: smaller",
+        "written: runs/collect/smaller/report.html",
+        "pushed: someone/demonstrations",
+    ]
     run(OFFLINE, hub, offline="1")
     run(OFFLINE, "http://127.0.0.1:9")  # no network, and nobody said so
 

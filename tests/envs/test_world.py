@@ -14,6 +14,7 @@ from dynmap_rl.envs.world import (
     WORKSPACE_HIGH,
     WORKSPACE_LOW,
     World,
+    simulate,
 )
 
 STILL = np.zeros(3)
@@ -23,8 +24,8 @@ def push(world: World, acceleration: float, seconds: float) -> np.ndarray:
     """Accelerate the cart along x past all its limits; the last state's ``[6]`` velocity."""
     for i in range(round(seconds / CONTROL_DT)):
         speed = acceleration * CONTROL_DT * np.array([i, i + 1])
-        world._simulate(np.array([speed[0], 0, 0]), np.array([speed[1], 0, 0]))
-    return world._read_velocity()
+        [found] = simulate([world], *(np.array([[x, 0, 0]]) for x in speed))
+    return found[6:]
 
 
 def play(world: World, actions: np.ndarray) -> np.ndarray:
