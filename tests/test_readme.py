@@ -311,6 +311,13 @@ def test_the_baseline_is_that_of_the_results():
     assert least <= high and low <= most, "by our protocol and by LeRobot's"
 
 
+def test_kills_are_those_of_the_results():
+    found = json.loads((ROOT / "recipes/results/kills.json").read_text())
+    assert list(found) == ["collect", "expert", "decoupled", "tables"]
+    assert {recipe["kills"] for recipe in found.values()} == {20}
+    assert "Killed at 20 random moments each, `collect`, `expert`, `decoupled` and `tables`" in " ".join(README.split())
+
+
 def test_the_validators_are_those_of_the_results():
     found = json.loads((ROOT / "recipes/results/validators.json").read_text()).values()
     text = " ".join(README.split())
