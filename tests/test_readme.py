@@ -5,6 +5,8 @@ import json
 import re
 from pathlib import Path
 
+import pytest
+
 from dynmap_rl.evaluation import wilson
 from dynmap_rl.evaluation.findings import markdown_findings, markdown_spread, spread
 from dynmap_rl.evaluation.paper import TABLES
@@ -300,14 +302,19 @@ def test_the_shipped_policy_is_that_of_the_results():
     assert f"[SR {rate:.1f} % [{low:.1f}, {high:.1f}], PE {error:.1f} mm]" in README
 
 
-def test_the_baseline_is_that_of_the_results():
-    summary = json.loads((ROOT / "recipes/results/act_balance_reaching.json").read_text())["summary"]
-    low, high = summary["SR_interval"]
-    assert f"[SR {summary['SR']:.1f} % [{low:.1f}, {high:.1f}], PE {summary['PE']:.1f} mm]" in README
-    theirs = json.loads((ROOT / "recipes/results/act_lerobot_eval.json").read_text())
+@pytest.mark.parametrize("policy", ["act", "diffusion", "dynmap"])
+def test_what_lerobot_trained_is_that_of_the_results(policy):
+    ours, theirs = (
+        json.loads((ROOT / f"recipes/results/{policy}_{name}.json").read_text())
+        for name in ("balance_reaching", "lerobot_eval")
+    )
+    low, high = ours["summary"]["SR_interval"]
+    said = f"[SR {ours['summary']['SR']:.1f} % [{low:.1f}, {high:.1f}], PE {ours['summary']['PE']:.1f} mm]"
+    assert f"{said}(recipes/results/{policy}_balance_reaching.json)" in README
     count, rate = theirs["n_episodes"], theirs["pc_success"]
     least, most = wilson(round(count * rate / 100), count)
-    assert f"[{rate:.1f} % [{least:.1f}, {most:.1f}] of {count}]" in README
+    said = f"[{rate:.1f} % [{least:.1f}, {most:.1f}] of {count}]"
+    assert f"{said}(recipes/results/{policy}_lerobot_eval.json)" in README
     assert least <= high and low <= most, "by our protocol and by LeRobot's"
 
 
@@ -315,7 +322,9 @@ def test_kills_are_those_of_the_results():
     found = json.loads((ROOT / "recipes/results/kills.json").read_text())
     assert list(found) == ["collect", "expert", "decoupled", "tables"]
     assert {recipe["kills"] for recipe in found.values()} == {20}
-    assert "Killed at 20 random moments each, `collect`, `expert`, `decoupled` and `tables`" in " ".join(README.split())
+    assert "Killed at 20 random moments each, `collect`, `expert`, `decoupled` and `tables`" in " ".join(
+        README.split()
+    )
 
 
 def test_the_validators_are_those_of_the_results():

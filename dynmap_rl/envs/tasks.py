@@ -41,7 +41,8 @@ from .world import ACCELERATION_LIMIT, CONTROL_DT, EPISODE_STEPS, VELOCITY_LIMIT
 SUCCESS_DISTANCE = 0.05  # m, about 3 pixels
 MARKER_SIZE = 0.04  # m
 REST_SPEED = 0.02  # m/s
-X_SPEED, Y_SPEED, SPIN = VELOCITY_LIMIT.tolist()
+SPEEDS, ACCELERATIONS = VELOCITY_LIMIT.tolist(), ACCELERATION_LIMIT.tolist()
+X_SPEED, Y_SPEED, SPIN = SPEEDS
 
 
 class BalanceReaching:
@@ -114,7 +115,7 @@ class BalanceReaching:
 
     def effort(self, world: World) -> float:
         """The penalty on acceleration and tilt of the cart."""
-        return 0.02 * squared(world.acceleration, ACCELERATION_LIMIT) + 0.1 * min(abs(world.position[2]), 1.0)
+        return 0.02 * squared(world.acceleration, ACCELERATIONS) + 0.1 * min(abs(world.position[2]), 1.0)
 
     def is_over(self, world: World) -> bool:
         """Whether the episode has failed for good, before its 120 steps have passed."""
@@ -225,9 +226,9 @@ class BinDropping(BalanceReaching):
     def reward(self, world: World) -> float:
         if self.is_over(world):
             return -1.0
-        effort = squared(world.acceleration, ACCELERATION_LIMIT)
+        effort = squared(world.acceleration, ACCELERATIONS)
         if self.is_in_bin(world):
-            motion = squared(world.velocity, VELOCITY_LIMIT)
+            motion = squared(world.velocity, SPEEDS)
             return 1.0 - 0.02 * effort - 0.1 * motion - 0.2 * min(abs(world.position[2]), 1.0)
         return 0.2 * math.exp(-4 * math.dist(world.position[3:5], world.goal)) - 0.02 * effort
 
@@ -257,9 +258,10 @@ def clipped(values: Sequence[float]) -> np.ndarray:
     return np.minimum(np.maximum(array, -10.0, out=array), 10.0, out=array)  # half the time of np.clip
 
 
-def squared(dynamics: np.ndarray, limits: np.ndarray) -> float:
+def squared(dynamics: np.ndarray, limits: Sequence[float]) -> float:
     """The sum of squares of the cart's three entries, in units of their limits."""
-    return sum((v / limit) ** 2 for v, limit in zip(dynamics[:3].tolist(), limits.tolist(), strict=True))
+    (x, y, turn), (x_limit, y_limit, turn_limit) = dynamics[:3].tolist(), limits
+    return (x / x_limit) ** 2 + (y / y_limit) ** 2 + (turn / turn_limit) ** 2
 
 
 TASKS = {task.name: task for task in (BalanceReaching(), BalanceReachingObstacle(), BinDropping())}
