@@ -1,10 +1,12 @@
 """The most memory that each recipe needs at a time, with all its processes, in its full size.
 
-    uv run python tests/benchmarks/memory.py
+    uv run python tests/benchmarks/memory.py              # all recipes
+    uv run python tests/benchmarks/memory.py probe play   # some of them
 
+Needs ``datasets/balance_reaching`` (``python recipes/collect.py``), and for ``generalize`` records another.
 Data, batches, models and evaluations are those of a full run; there are only fewer optimiser steps, which need the same
 memory again and again. The cells of ``tables`` are runs of these. Shared pages count once (proportional set size, so Linux only). Writes
-``recipes/results/memory.json``.
+``recipes/results/memory.json``, where recipes that were not asked for stay as they are.
 """
 
 from __future__ import annotations
@@ -16,22 +18,25 @@ import tempfile
 import time
 from pathlib import Path
 
-from dynmap_rl.runs import write_json
+from dynmap_rl.runs import read_json, write_json
 
 RECIPES = Path(__file__).parents[2] / "recipes"
+RESULTS = RECIPES / "results" / "memory.json"
+DATASET = Path("datasets/balance_reaching")
 FEW = ["--updates", "30"]
 POLICY = ["--policy_updates", "30"]
-COMMANDS = {  # in this order: later ones take the world model of earlier ones
-    "collect": ["--output", "datasets/balance_reaching"],
+WORLD_MODEL = ["--world_model", "balance_reaching"]  # the one that ships
+COMMANDS = {
+    "collect": ["--output", "collected"],
     "expert": ["--run", "expert", "--iterations", "3"],
     "decoupled": ["--run", "decoupled", *FEW, *POLICY],
-    "generalize": ["--task", "bin_dropping", "--world_model", "decoupled", "--run", "generalize", *POLICY],
+    "generalize": ["--task", "bin_dropping", *WORLD_MODEL, "--run", "generalize", *POLICY],
     "joint": ["--run", "joint", *FEW],
     "end_to_end": ["--run", "end_to_end", *FEW],
     "evaluate": [],
-    "latent_ppo": ["--world_model", "decoupled", "--run", "latent_ppo", "--iterations", "3"],
-    "probe": ["--runs", "decoupled"],
-    "add_dynamics": ["--dataset", "datasets/balance_reaching", "--track", "--replace", "--output", "tracked"],
+    "latent_ppo": [*WORLD_MODEL, "--run", "latent_ppo", "--iterations", "3"],
+    "probe": ["--runs", "balance_reaching"],
+    "add_dynamics": ["--dataset", str(DATASET), "--track", "--replace", "--output", "tracked"],
     "figures": ["--only", "fig2,fig4"],
     "play": ["--policy", "balance_reaching", "--steps", "240", "--gif", "film.gif"],
 }
@@ -69,15 +74,23 @@ def held(pid: int) -> int:
     return next((int(line.split()[1]) for line in lines if line.startswith("Pss:")), 0)
 
 
-def main() -> None:
-    found = {}
-    with tempfile.TemporaryDirectory() as folder:
-        for name, options in COMMANDS.items():
-            command = [sys.executable, str(RECIPES / f"{name}.py"), *options]
-            found[name] = round(peak(command, folder), 2)
-            print(f"{name}: {found[name]} GB", flush=True)
-    write_json(RECIPES / "results" / "memory.json", {"unit": "GB", "peak": found})
+def main(names: list[str]) -> None:
+    if unknown := set(names) - set(COMMANDS):
+        sys.exit(f"unknown recipes {sorted(unknown)}; choose from {list(COMMANDS)}")
+    if not DATASET.exists():
+        sys.exit(f"there is no {DATASET}; record it with python recipes/collect.py")
+    found = read_json(RESULTS)["peak"] if RESULTS.exists() else {}
+    for name in names or COMMANDS:
+        with tempfile.TemporaryDirectory() as folder:
+            link = Path(folder) / DATASET
+            link.parent.mkdir()
+            link.symlink_to(DATASET.resolve())
+            found[name] = round(
+                peak([sys.executable, str(RECIPES / f"{name}.py"), *COMMANDS[name]], folder), 2
+            )
+        print(f"{name}: {found[name]} GB", flush=True)
+        write_json(RESULTS, {"unit": "GB", "peak": found})
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])
