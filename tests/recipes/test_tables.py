@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import commands
@@ -162,7 +163,8 @@ def test_what_stops_the_command_stops_its_cells_and_begins_no_other(recordings, 
     )
     smoke = "--smoke", "--results", "results", "--only"
     command = [sys.executable, str(RECIPE), *smoke, "balance_reaching_joint_velocity"]
-    with subprocess.Popen(command, cwd=tmp_path, start_new_session=True) as process:
+    heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # which tests in the background do not
+    with subprocess.Popen(command, cwd=tmp_path, start_new_session=True, preexec_fn=heed) as process:
         while not (first / "config.json").exists():
             assert process.poll() is None
             time.sleep(0.02)
