@@ -26,6 +26,7 @@ ACCELERATION_LIMIT = np.array([3.0, 3.0, 10.0])  # m/s^2, m/s^2, rad/s^2
 WORKSPACE_LOW = np.array([0.05, 0.03, -math.pi / 3])  # m, m, rad
 WORKSPACE_HIGH = np.array([0.95, 0.95, math.pi / 3])
 ACTION_LIMIT = VELOCITY_LIMIT * CONTROL_DT  # the largest change of the commanded pose in one control step
+LARGEST_CHANGE = ACCELERATION_LIMIT * CONTROL_DT**2  # of an action, from one control step to the next
 
 GROUND = -0.25  # m, where a dropped block comes to lie, below the picture
 DROP_TILT = math.pi / 4  # rad, relative to the cart
@@ -149,14 +150,6 @@ class World:
         """The position-update action that gives this cart acceleration from the present state."""
         return self.action + np.asarray(acceleration, dtype=np.float64) * CONTROL_DT**2
 
-    def _limit(self, action: np.ndarray) -> list[float]:
-        """The action that the cart can execute: limits of acceleration, of speed, and room left to brake."""
-        action = np.asarray(action, dtype=np.float64)
-        if action.shape != (3,) or not all(map(math.isfinite, wanted := action.tolist())):
-            raise ValueError(f"an action is 3 finite numbers (dX, dY, dTheta), got {action}")
-        state = zip(wanted, self.action.tolist(), self.commanded.tolist(), AXES, strict=True)
-        return [_limit_axis(*values) for values in state]
-
     def _locate_block(self) -> tuple[float, float, float]:
         cx, cy, ct, bx, by, bt = self.position.tolist()
         c, s = math.cos(ct), math.sin(ct)
@@ -183,9 +176,9 @@ class World:
 
 def step_worlds(worlds: Sequence[World], actions: Sequence[np.ndarray]) -> None:
     """:meth:`World.step` of every world at once, which is faster than one after the other and gives the same bits."""
-    limited = [world._limit(action) for world, action in zip(worlds, actions, strict=True)]
-    limited = np.array(limited, np.float32).astype(np.float64)  # as stored, so that a replay is bit-exact
     last = np.array([world.action for world in worlds])
+    limited = _limit(actions, last, np.array([world.commanded for world in worlds]))
+    limited = limited.astype(np.float32).astype(np.float64)  # as stored, so that a replay is bit-exact
     found = simulate(worlds, last / CONTROL_DT, limited / CONTROL_DT)
     for world, action, bodies in zip(worlds, limited, found, strict=True):
         world._finish(action, bodies)
@@ -199,34 +192,19 @@ def simulate(worlds: Sequence[World], before: np.ndarray, after: np.ndarray) -> 
     return choose_run()(bodies, before, after, SUBSTEPS, CONTROL_DT / SUBSTEPS)
 
 
-def _limit_axis(action: float, last: float, commanded: float, axis: tuple[float, ...]) -> float:
-    """One axis of :meth:`World._limit`; plain numbers, for arrays of three are ten times slower."""
-    low, high, velocity, acceleration, room = axis
-    backwards = forwards = velocity
-    if commanded - low < room:
-        backwards = min(velocity, _braking_speed(max(commanded - low, 0.0), acceleration))
-    if high - commanded < room:
-        forwards = min(velocity, _braking_speed(max(high - commanded, 0.0), acceleration))
-    change = acceleration * CONTROL_DT**2
-    action = min(max(action, -backwards * CONTROL_DT), forwards * CONTROL_DT)
-    return min(max(action, last - change), last + change)
+# Of the speed from which a cart stops within its room back and forth, braking at the limit in whole control steps.
+WAYS, EDGES = np.array([[[1.0]], [[-1.0]]]), np.stack([-WORKSPACE_LOW, WORKSPACE_HIGH])[:, None]
+HALF_BRAKE, TWICE = ACCELERATION_LIMIT * CONTROL_DT / 2, 2 * ACCELERATION_LIMIT
+HALF_SQUARED = HALF_BRAKE**2
 
 
-def _braking_speed(room: float, acceleration: float) -> float:
-    """The speed from which the cart still stops within ``room``, braking at the limit in whole control steps."""
-    brake = acceleration * CONTROL_DT
-    return math.sqrt(brake**2 / 4 + 2 * acceleration * room) - brake / 2
-
-
-def _axis(low: float, high: float, velocity: float, acceleration: float) -> tuple[float, ...]:
-    """The limits of an axis, and the room within which its edges slow the cart down, a little more than needed."""
-    return low, high, velocity, acceleration, 1.001 * velocity * (velocity / acceleration + CONTROL_DT) / 2
-
-
-AXES = [
-    _axis(*limits)
-    for limits in zip(
-        *(a.tolist() for a in (WORKSPACE_LOW, WORKSPACE_HIGH, VELOCITY_LIMIT, ACCELERATION_LIMIT)),
-        strict=True,
-    )
-]
+def _limit(actions: Sequence[np.ndarray], last: np.ndarray, commanded: np.ndarray) -> np.ndarray:
+    """The actions ``[N, 3]`` that the carts can execute: limits of acceleration, of speed, and room left to brake."""
+    wanted = np.array(actions, dtype=np.float64)
+    if wanted.shape != last.shape or not np.isfinite(wanted).all():
+        raise ValueError(f"an action is 3 finite numbers (dX, dY, dTheta), got {wanted}")
+    room = np.maximum(WAYS * commanded + EDGES, 0.0)  # [2, N, 3]
+    speed = np.sqrt(HALF_SQUARED + TWICE * room) - HALF_BRAKE
+    back, forth = np.minimum(speed, VELOCITY_LIMIT) * CONTROL_DT
+    wanted = np.minimum(np.maximum(wanted, -back), forth)
+    return np.minimum(np.maximum(wanted, last - LARGEST_CHANGE), last + LARGEST_CHANGE)
