@@ -65,7 +65,7 @@ def train_ppo(
     loss_module = ClipPPOLoss(
         actor, critic, clip_epsilon=settings.clip, entropy_coeff=settings.entropy, critic_coeff=1.0
     )
-    optimizer = torch.optim.Adam(loss_module.parameters(), lr=settings.learning_rate, eps=1e-5)
+    optimizer = torch.optim.Adam(loss_module.parameters(), settings.learning_rate, eps=1e-5, fused=True)
 
     start, seconds = 0, 0.0
     state_path = folder / "checkpoint" / "training_state.pt"
