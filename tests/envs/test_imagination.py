@@ -60,7 +60,7 @@ def reward(td):
 
 
 @pytest.mark.parametrize(
-    "arguments", [{}, {"decode_pixels": True}, {"reward": reward, "decode_pixels": True}], ids=str
+    "arguments", [{}, {"decode_pixels": True}, {"reward": reward, "decode_pixels": True}], ids=" ".join
 )
 def test_specs(frames, arguments):
     env = ImaginationEnv(make_model(), make_start(make_model(), frames), **arguments)
