@@ -69,7 +69,6 @@ def main(config: Config) -> None:
         print(lines[-1])
     folder = Path("runs/add_dynamics") / config.output.name
     write_dataset_page(folder, config.output, dataclasses.asdict(config), "\n".join(lines))
-    print(f"written: {folder / 'report.html'}")
 
 
 if __name__ == "__main__":

@@ -46,9 +46,7 @@ def main(config: Config) -> None:
     sizes = config.episodes, config.eval_episodes
     record_dataset(output, config.task, config.kind, *sizes, config.workers, config.expert)
     print(f"{'complete already' if complete else 'done'}: {output}")
-    if not (page := Path("runs/collect") / output.name / "report.html").exists() or not complete:
-        write_dataset_page(page.parent, output, dataclasses.asdict(config))
-        print(f"written: {page}")
+    write_dataset_page(Path("runs/collect") / output.name, output, dataclasses.asdict(config))
     if config.push_to_hub:
         push_dataset(output, config.push_to_hub)
         print(f"pushed: {config.push_to_hub}")

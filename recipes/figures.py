@@ -48,16 +48,17 @@ def main(config: Config) -> None:
     if unknown := [name for name in names if name not in FIGURES]:
         raise ValueError(f"--only: no figure {', '.join(unknown)}; choose from {', '.join(FIGURES)}")
     datasets = name_datasets(config)
-    missing = []
+    drawn, missing = [], []
     for name in names:
         try:
             FIGURES[name][0](config, datasets)
             print(f"written: {config.output / name}.png", flush=True)
+            drawn.append(name)
         except ValueError as error:
             missing.append(f"{name}: {error}")
-    if len(missing) < len(names):
+    if drawn:
         captions = {f"{name}.png": caption for name, (_, caption) in FIGURES.items()}
-        said, settings = "\n".join(missing) or "All are there.", dataclasses.asdict(config)
+        said, settings = "\n".join([f"drawn: {', '.join(drawn)}", *missing]), dataclasses.asdict(config)
         write_html(config.output, "The paper's figures", said, command_line(), settings, captions)
     if missing:
         raise ValueError("; ".join(missing))

@@ -177,13 +177,14 @@ def main(config: Config) -> None:
         return print(
             f"{len(cells) - len(todo)} of {len(cells)} cells are done; about {hours:.1f} hours of one core are left"
         )
-    if not todo:
-        return print(
-            f"nothing to do: {len(cells)} cells are in {config.results}; for a grid of your own name --results"
-        )
     from dynmap_rl.evaluation.tables import write_tables_page
     from dynmap_rl.settings import find_or_record
 
+    if not todo:
+        print(
+            f"nothing to do: {len(cells)} cells are in {config.results}; --results names a grid of your own"
+        )
+        return write_tables_page(config.runs, config.results, vars(config))
     for task in {cell.task for cell in sources + todo}:  # here, so that cells do not record at the same time
         find_or_record(SimpleNamespace(task=task, dataset=None, smoke=config.smoke))
     failed = launch([*sources, *(cell for cell in todo if not cell.needs)], config)

@@ -188,11 +188,12 @@ def test_ranges_of_the_dynamics_are_those_of_the_results():
 def test_the_speed_table_is_that_of_the_results(monkeypatch):
     monkeypatch.syspath_prepend(ROOT / "tests/benchmarks")
     benchmarks = importlib.import_module("run")
-    results, main_job = (json.loads(path.read_text()) for path in (benchmarks.RESULTS, benchmarks.MAIN_JOB))
-    assert benchmarks.markdown(results, main_job) in README
-    assert f"[{main_job['real_seconds'] / 60:.0f} minutes from a fresh clone]" in README
-    judged = main_job | {"SR": 99.87, "SR_interval": [99.61, 100.0], "PE": 12.34}
-    assert " min, SR 99.9 % [99.6, 100.0], PE 12.3 mm |" in benchmarks.markdown(results, judged)
+    results, main_jobs = (json.loads(path.read_text()) for path in (benchmarks.RESULTS, benchmarks.MAIN_JOBS))
+    assert benchmarks.markdown(results, main_jobs) in README
+    minutes = [run["real_seconds"] / 60 for run in main_jobs["runs"]]
+    assert f"[{min(minutes):.0f} to {max(minutes):.0f} minutes from a fresh clone]" in README
+    judged = main_jobs["runs"][0] | {"SR": 99.87, "SR_interval": [99.61, 100.0], "PE": 12.34}
+    assert " min, SR 99.9 % [99.6, 100.0], PE 12.3 mm |" in benchmarks.markdown(results, {"runs": [judged]})
 
 
 def test_errors_of_derived_dynamics_are_those_of_the_results():

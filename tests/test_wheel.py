@@ -17,6 +17,15 @@ from dynmap_rl.modules import load_actor
 print(dynmap_rl.__file__, load_actor("balance_reaching").policy.width, [len(list_checkpoints(task)) for task in TASKS])
 """
 
+LEARN = """
+import sys
+import gymnasium
+from stable_baselines3 import PPO
+assert "dynmap_rl" not in sys.modules
+model = PPO("MlpPolicy", gymnasium.make("dynmap_rl:dynmap_rl/BalanceReaching-v0", obs_type="state"), n_steps=64)
+print(model.learn(64).num_timesteps, sys.modules["dynmap_rl"].__file__)
+"""
+
 
 @pytest.fixture
 def python(installed, tmp_path):
@@ -41,8 +50,15 @@ def test_weights_and_experts_are_in_the_wheel(python, installed):
 def test_recipes_run_on_it(python, recording, tmp_path):
     shutil.copytree(RECIPES, tmp_path / "mine", ignore=shutil.ignore_patterns("results", "__pycache__"))
     assert "SR 100.0 %" in python("mine/evaluate.py", "--policy", "balance_reaching", "--episodes", 2)
+    assert "PPO on latents" in python("mine/latent_ppo.py", "--smoke", "--world_model", "balance_reaching")
     python("mine/collect.py", "--episodes", 1, "--eval_episodes", 1, "--workers", 1, "--output", "mine/data")
     state = "--state", "dynamics.position", "--angles", "2,5", "--replace"
     assert "done: derived" in python(
         "mine/add_dynamics.py", "--dataset", "mine/data", *state, "--output", "derived"
     )
+
+
+def test_stable_baselines_learns_on_its_id(python, installed):
+    pytest.importorskip("stable_baselines3")
+    steps, file = python("-c", LEARN).split()
+    assert steps == "64" and Path(file).is_relative_to(installed)

@@ -17,11 +17,14 @@ from dynmap_rl.modules import DYNAMICS
 from .html import write_html
 
 EPISODES = 4  # shown
+FRAMES = 120  # of the animation, at most
 WIDEST = 192  # pixels of a frame on the page
 
 
-def write_dataset_page(folder: Path, dataset: str | Path, settings: dict, said: str = "") -> Path:
+def write_dataset_page(folder: Path, dataset: str | Path, settings: dict, said: str = "") -> None:
     """The page, with sizes, ranges of the dynamics, the first episodes as an animation and the dynamics of the first.
+
+    The dataset is done without it: where a page cannot be made, the reason is printed and no error raised.
 
     Args:
         folder: where ``report.html`` and its pictures are written.
@@ -29,12 +32,19 @@ def write_dataset_page(folder: Path, dataset: str | Path, settings: dict, said: 
         settings: of the recipe that made it.
         said: what that printed.
     """
-    root = find_dataset(dataset)
+    try:
+        print(f"written: {_write_page(folder, find_dataset(dataset), settings, said)}")
+    except (OSError, ValueError) as error:
+        print(f"no page in {folder}: {error}")
+
+
+def _write_page(folder: Path, root: Path, settings: dict, said: str) -> Path:
     info = read_info(root)
     quantities = [q for q in DYNAMICS if f"dynamics.{q}" in info["features"]]
     splits = ", ".join(f"{name} {span}" for name, span in (info.get("splits") or {}).items())
     lines = [
-        f"{info['total_episodes']} episodes ({splits}), {info['total_frames']} frames, {info['fps']} a second"
+        f"{info.get('total_episodes', '?')} episodes ({splits}), {info['total_frames']} frames, "
+        f"{info.get('fps', '?')} a second"
     ]
     lines += [*said.splitlines(), "", *_ranges(root, info, quantities)]
     _plot_dynamics(root, info, quantities, folder / "dynamics.png")
@@ -76,7 +86,7 @@ def _plot_dynamics(root: Path, info: dict, quantities: list[str], path: Path) ->
 
 
 def _film(root: Path, info: dict, path: Path) -> None:
-    """The first episodes; those that end early stand still."""
+    """The first episodes, of long ones every so many frames; those that end early stand still."""
     from .figures import save_gif
 
     episodes = []
@@ -85,6 +95,7 @@ def _film(root: Path, info: dict, path: Path) -> None:
         if len(episodes) == EPISODES:
             break
     steps = max(map(len, episodes))
-    frames = np.stack([frames[np.minimum(np.arange(steps), len(frames) - 1)] for frames in episodes])
+    shown = np.arange(0, steps, -(-steps // FRAMES))
+    frames = np.stack([frames[np.minimum(shown, len(frames) - 1)] for frames in episodes])
     pixels = torch.from_numpy(frames).permute(0, 1, 4, 2, 3)
     save_gif(pixels, path, columns=len(episodes), scale=max(1, WIDEST // pixels.shape[-1]))

@@ -33,7 +33,7 @@ def test_records_where_it_says_and_then_says_that_it_is_complete(
     assert load_dataset(f"datasets/{name}").shape == (2, 120)
     assert [p.name for p in (tmp_path / "datasets").iterdir()] == [name]
     main(config)
-    assert capsys.readouterr().out == f"complete already: datasets/{name}\n"
+    assert capsys.readouterr().out == f"complete already: datasets/{name}\nwritten: {page}\n"
 
 
 def test_a_mistake_is_one_line(recording, tmp_path):

@@ -100,7 +100,9 @@ def test_cells_run_once_and_are_printed_beside_the_paper(recordings, tmp_path):
     assert done(again) == ["bin_dropping_joint_none_recurrent"]
     assert all(path.stat().st_mtime_ns == time for path, time in times.items() if "bin" not in path.name)
 
-    assert run(tmp_path, *smoke).stdout.startswith("nothing to do: 3 cells are in results")
+    said, page = run(tmp_path, *smoke).stdout.splitlines()
+    assert said.startswith("nothing to do: 3 cells are in results")
+    assert page == "written: runs/tables_smoke/report.html"
 
     shutil.rmtree(tmp_path / "runs")  # as in a fresh clone, where results are but no runs
     (tmp_path / "results/bin_dropping_joint_none_recurrent.json").unlink()
