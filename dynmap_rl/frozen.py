@@ -17,7 +17,8 @@ from dynmap_rl import data, modules, runs
 from dynmap_rl.envs.tasks import NO_TASK
 from dynmap_rl.evaluation import evaluate, policy_errors
 from dynmap_rl.modules import Actor, WorldModel
-from dynmap_rl.training import fingerprint, train_policy
+from dynmap_rl.training import train_policy
+from dynmap_rl.weights import fingerprint
 
 TRAININGS = ["decoupled", "joint", "end_to_end"]
 

@@ -10,7 +10,8 @@ from dynmap_rl import data, modules, runs
 from dynmap_rl.envs.tasks import NO_TASK
 from dynmap_rl.evaluation import evaluate, policy_errors
 from dynmap_rl.settings import load_episodes
-from dynmap_rl.training import fingerprint, prediction_errors, train_jointly
+from dynmap_rl.training import prediction_errors, train_jointly
+from dynmap_rl.weights import fingerprint
 
 
 def train_seeds(

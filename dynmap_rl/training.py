@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +17,7 @@ from dynmap_rl.envs.tasks import NO_TASK, get_task
 from dynmap_rl.loggers import log_metrics
 from dynmap_rl.modules import WorldModel, mixed_precision
 from dynmap_rl.objectives import ImitationLoss, JointLoss, WorldModelLoss
+from dynmap_rl.parts import differentiate, map_in_threads, split_batch
 
 ADVICE = "what was kept before stays; run again with a lower learning rate, in another --run"
 GROUPS = {"": [0, 1, 3, 4], "_angle": [2, 5]}  # entries of our tasks' dynamics that have one unit
@@ -47,10 +47,9 @@ def train_world_model(
     def held_out() -> dict[str, float]:
         return prediction_errors(world_model, episodes["eval"], by_entry=_has_no_task(settings))
 
-    loss_module = _make_loss(world_model, settings)
     _fit(
         world_model,
-        loss_module,
+        lambda generator: _make_loss(world_model, settings, generator),
         episodes["train"],
         held_out,
         folder,
@@ -82,12 +81,12 @@ def train_jointly(
         end_to_end: the policy's loss alone.
     """
     model = nn.ModuleDict({"world_model": world_model, "policy": policy})
-    if end_to_end:
-        loss_module = JointLoss(WorldModelLoss(world_model), policy, 1.0, settings.emphasis, end_to_end=True)
-    else:
-        loss_module = JointLoss(
-            _make_loss(world_model, settings), policy, settings.beta_joint, settings.emphasis
-        )
+
+    def make_loss(generator: torch.Generator) -> JointLoss:
+        if end_to_end:
+            return JointLoss(WorldModelLoss(world_model), policy, 1.0, settings.emphasis, end_to_end=True)
+        of_world_model = _make_loss(world_model, settings, generator)
+        return JointLoss(of_world_model, policy, settings.beta_joint, settings.emphasis)
 
     def held_out() -> dict[str, float]:
         errors = {}
@@ -97,20 +96,21 @@ def train_jointly(
 
     symmetric = not _has_no_task(settings) and get_task(settings.task).symmetric
     limits = {} if symmetric else {"max_shift": 0, "mirror": False}
-    _fit(model, loss_module, episodes["train"], held_out, folder, settings, seed, save_every, limits)
+    _fit(model, make_loss, episodes["train"], held_out, folder, settings, seed, save_every, limits)
 
 
 def _has_no_task(settings) -> bool:
     return getattr(settings, "task", None) == NO_TASK
 
 
-def _make_loss(world_model: WorldModel, settings) -> WorldModelLoss:
-    return WorldModelLoss(world_model, settings.beta_z, settings.beta_dynamics, rgb_steps=settings.rgb_steps)
+def _make_loss(world_model: WorldModel, settings, generator: torch.Generator) -> WorldModelLoss:
+    weights = settings.beta_z, settings.beta_dynamics
+    return WorldModelLoss(world_model, *weights, rgb_steps=settings.rgb_steps, generator=generator)
 
 
 def _fit(
     model: nn.Module,
-    loss_module: nn.Module,
+    make_loss: Callable[[torch.Generator], nn.Module],
     episodes: TensorDictBase,
     held_out: Callable[[], dict[str, float]],
     folder: Path,
@@ -119,49 +119,69 @@ def _fit(
     save_every: int,
     limits: dict | None = None,
 ) -> None:
-    """The loop over windows; ``limits`` are those of the augmentation."""
+    """The loop over windows; ``limits`` are those of the augmentation. Every part of a batch has a generator of its own
+    (see :mod:`dynmap_rl.parts`), which also draws what its loss has to draw."""
     device = next(model.parameters()).device
     model.to(memory_format=torch.channels_last)  # with bfloat16 six times faster on a CPU
     optimizer = make_optimizer(model, settings.learning_rate, weight_decay=1e-4)
-    generator = torch.Generator(device).manual_seed(seed)
+    parameters = [p for group in optimizer.param_groups for p in group["params"]]
     episodes = episodes.select("pixels", "action", "goal", "dynamics", "disturbed", strict=False).to(device)
+    sizes = split_batch(settings.windows, device)
+    generators = [torch.Generator(device).manual_seed(1000 * seed + part) for part in range(len(sizes))]
+    loss_modules = [make_loss(generator) for generator in generators]
+
+    def find_losses(part: int) -> dict[str, torch.Tensor]:
+        windows = _draw_windows(episodes, sizes[part], settings, generators[part], limits or {})
+        with mixed_precision(device):
+            losses = loss_modules[part](windows)
+        return {name: value * (sizes[part] / settings.windows) for name, value in losses.items()}
 
     start, first, path = 0, None, folder / "checkpoint" / "world_model.pt"
     if state := runs.load_training_state(path):
         model.load_state_dict(state["model"])
         optimizer.load_state_dict(state["optimizer"])
-        if state["generator"].shape == generator.get_state().shape:
-            generator.set_state(state["generator"])
-        else:  # it was on another kind of device
-            generator.manual_seed(seed + state["update"])
         start, first = state["update"], state.get("first_loss")
+        _restore(generators, state.get("generators", []), start)
     runs.truncate_metrics(folder, start)
     progress = tqdm(range(start, settings.updates), folder.name, settings.updates, initial=start)
-    for update in progress:
-        set_learning_rate(optimizer, settings.learning_rate, update, settings.updates)
-        windows = sample_windows(episodes, settings.windows, settings.window_steps, generator)
-        if not _has_no_task(settings):
-            windows = augment(windows, generator, **limits or {})
-        windows = add_distractors(windows, generator, settings.distractors)
-        with mixed_precision(device):
-            losses = loss_module(windows)
-        norm = step(sum(losses.values()), optimizer)
-        done = update + 1
-        saved = done % save_every == 0 or done == settings.updates
-        if saved or done % 50 == 0 or done == 1:
-            losses = {name: value.item() for name, value in losses.items()}
-            first = check_loss(sum(losses.values()), norm, first)
-            progress.set_postfix({k.removeprefix("loss_"): f"{v:.3f}" for k, v in losses.items()})
-        if saved:
-            log_metrics(folder, done, settings.logger, **losses, **held_out())
-            runs.save_training_state(
-                path,
-                model=model.state_dict(),
-                optimizer=optimizer.state_dict(),
-                generator=generator.get_state(),
-                update=done,
-                first_loss=first,
-            )
+    with map_in_threads(len(sizes)) as map_parts:
+        for update in progress:
+            set_learning_rate(optimizer, settings.learning_rate, update, settings.updates)
+            losses = differentiate(find_losses, range(len(sizes)), parameters, map_parts)
+            norm = descend(optimizer)
+            done = update + 1
+            saved = done % save_every == 0 or done == settings.updates
+            if saved or done % 50 == 0 or done == 1:
+                losses = {name: value.item() for name, value in losses.items()}
+                first = check_loss(sum(losses.values()), norm, first)
+                progress.set_postfix({k.removeprefix("loss_"): f"{v:.3f}" for k, v in losses.items()})
+            if saved:
+                log_metrics(folder, done, settings.logger, **losses, **held_out())
+                runs.save_training_state(
+                    path,
+                    model=model.state_dict(),
+                    optimizer=optimizer.state_dict(),
+                    generators=[generator.get_state() for generator in generators],
+                    update=done,
+                    first_loss=first,
+                )
+
+
+def _draw_windows(episodes, size: int, settings, generator: torch.Generator, limits: dict) -> TensorDictBase:
+    windows = sample_windows(episodes, size, settings.window_steps, generator)
+    if not _has_no_task(settings):
+        windows = augment(windows, generator, **limits)
+    return add_distractors(windows, generator, settings.distractors)
+
+
+def _restore(generators: list[torch.Generator], states: list[torch.Tensor], update: int) -> None:
+    """Their states, or, where these are of another kind of device or of an earlier release, new ones."""
+    shapes = [generator.get_state().shape for generator in generators]
+    for part, generator in enumerate(generators):
+        if [state.shape for state in states] == shapes:
+            generator.set_state(states[part])
+        else:
+            generator.manual_seed(generator.initial_seed() + 1_000_000 * update)
 
 
 def train_policy(
@@ -232,15 +252,6 @@ def policy_error(world_model: WorldModel, policy: nn.Module, episodes: TensorDic
     return ImitationLoss(policy)(compute_features(world_model, episodes))["loss_policy"].item()
 
 
-def fingerprint(module: nn.Module) -> str:
-    """SHA-256 over all weights and buffers: equal before and after means that nothing has changed."""
-    digest = hashlib.sha256()
-    for name, value in sorted(module.state_dict().items()):
-        digest.update(name.encode())
-        digest.update(value.cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()
-
-
 def make_optimizer(module: nn.Module, learning_rate: float, weight_decay: float) -> torch.optim.Optimizer:
     """AdamW as all our trainings have it."""
     return torch.optim.AdamW(
@@ -259,6 +270,11 @@ def step(loss: torch.Tensor, optimizer) -> torch.Tensor:
     """One optimiser step with clipped gradients; their norm. Nothing in it waits for an accelerator."""
     optimizer.zero_grad()
     loss.backward()
+    return descend(optimizer)
+
+
+def descend(optimizer) -> torch.Tensor:
+    """:func:`step` by the gradients that are there."""
     norm = nn.utils.clip_grad_norm_([p for g in optimizer.param_groups for p in g["params"]], 1.0)
     optimizer.step()
     return norm

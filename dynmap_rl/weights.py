@@ -3,6 +3,7 @@ proportion to their size."""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -45,3 +46,12 @@ def load_module[Module: nn.Module](path: Path, make: Callable[[], Module]) -> Mo
     except Exception as error:  # of torch for impossible sizes, of safetensors for damaged files
         raise ValueError(f"{path} does not hold this model's weights: {error}") from error
     return module
+
+
+def fingerprint(module: nn.Module) -> str:
+    """SHA-256 over all weights and buffers: equal before and after means that nothing has changed."""
+    digest = hashlib.sha256()
+    for name, value in sorted(module.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(value.cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()

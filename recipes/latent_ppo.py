@@ -76,7 +76,7 @@ def main(config: Config) -> None:
     from dynmap_rl.evaluation import failures_first, write_html
     from dynmap_rl.experts.ppo import POSITIVE, fresh_scenes, rates, train_ppo
     from dynmap_rl.loggers import check_logger
-    from dynmap_rl.training import fingerprint
+    from dynmap_rl.weights import fingerprint
 
     if config.smoke:
         replace_defaults(config, SMOKE)

@@ -9,7 +9,8 @@ from tensordict import TensorDict
 from dynmap_rl import frozen, runs, training
 from dynmap_rl.data import compute_features, sample_windows
 from dynmap_rl.modules import DYNAMICS, make_policy, make_world_model, mixed_precision
-from dynmap_rl.training import check_loss, fingerprint, train_policy, train_world_model
+from dynmap_rl.training import check_loss, descend, train_policy, train_world_model
+from dynmap_rl.weights import fingerprint
 
 CONSTANTS = {
     "action": {"low": [-0.02, -0.02, -0.05], "high": [0.02, 0.02, 0.05]},
@@ -78,12 +79,37 @@ def test_a_resumed_world_model_equals_an_uninterrupted_one(tmp_path, monkeypatch
     runs.append_metrics(tmp_path / "parts", 5, loss_rgb=0.0)  # written after the last state, then killed
     monkeypatch.undo()
     resumed, updates = make_model(), []
-    monkeypatch.setattr(training, "sample_windows", lambda *args: updates.append(1) or sample_windows(*args))
+    monkeypatch.setattr(training, "descend", lambda optimizer: updates.append(1) or descend(optimizer))
     train_world_model(resumed, episodes, tmp_path / "parts", SETTINGS, save_every=2)
 
     assert len(updates) == SETTINGS.updates - 4, "what was saved is not trained again"
     assert fingerprint(resumed) == fingerprint(whole)
     assert runs.read_metrics(tmp_path / "parts") == runs.read_metrics(tmp_path / "whole")
+
+
+def test_weights_are_the_same_with_one_thread_or_two(tmp_path):
+    episodes = dict.fromkeys(("train", "eval"), make_episodes())
+    models, before = [make_model(), make_model()], torch.get_num_threads()
+    try:
+        for threads, model in enumerate(models, 1):
+            torch.set_num_threads(threads)
+            torch.manual_seed(threads)  # what is drawn is drawn by generators of the training's own
+            train_world_model(model, episodes, tmp_path / str(threads), SETTINGS)
+    finally:
+        torch.set_num_threads(before)
+    assert fingerprint(models[0]) == fingerprint(models[1]) != fingerprint(make_model())
+
+
+def test_a_training_goes_on_after_states_of_another_kind_of_device(tmp_path):
+    """Whose generators have states of another shape."""
+    episodes = dict.fromkeys(("train", "eval"), make_episodes())
+    train_world_model(make_model(), episodes, tmp_path, SETTINGS)
+    path = tmp_path / "checkpoint/world_model.pt"
+    state = torch.load(path, weights_only=True)
+    torch.save({**state, "generators": [torch.zeros(16, dtype=torch.uint8)]}, path)
+    model, settings = make_model(), SimpleNamespace(**{**vars(SETTINGS), "updates": 8})
+    train_world_model(model, episodes, tmp_path, settings)
+    assert runs.read_metrics(tmp_path)[-1]["step"] == 8
 
 
 def test_training_a_policy_leaves_the_world_model_as_it_was(tmp_path):
@@ -165,7 +191,7 @@ def train_from(update, change, folder, monkeypatch, **settings):
     def sample(*args):
         windows = sample_windows(*args)
         calls.append(1)
-        return change(windows) if len(calls) > update else windows
+        return change(windows) if len(calls) > 2 * update else windows  # of two parts each
 
     monkeypatch.setattr(training, "sample_windows", sample)
     episodes = dict.fromkeys(("train", "eval"), make_episodes())

@@ -11,4 +11,5 @@ def mixed_precision(device: torch.device | str) -> torch.autocast:
     fast = kind != "cpu" or (
         torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported()
     )
-    return torch.autocast(kind, torch.bfloat16, enabled=fast)
+    # No cache of cast weights: threads would share it, and no weight is used twice.
+    return torch.autocast(kind, torch.bfloat16, enabled=fast, cache_enabled=False)

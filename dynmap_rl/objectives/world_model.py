@@ -37,6 +37,7 @@ class WorldModelLoss(LossModule):
         stop_gradient: the latent loss moves the predicted change of the latent only. With its full gradient it is
             least for latents that do not vary, and the reconstruction stalls.
         rgb_steps: decode the frames of so many random steps of a window; None decodes all.
+        generator: draws those steps; by default torch's own.
     """
 
     @dataclass
@@ -55,9 +56,10 @@ class WorldModelLoss(LossModule):
         beta_dynamics: float = 1.0,
         stop_gradient: bool = True,
         rgb_steps: int | None = None,
+        generator: torch.Generator | None = None,
     ):
         super().__init__()
-        self.world_model = world_model
+        self.world_model, self.generator = world_model, generator
         self.beta_z, self.beta_dynamics = beta_z, beta_dynamics
         self.stop_gradient, self.rgb_steps = stop_gradient, rgb_steps
 
@@ -113,7 +115,7 @@ class WorldModelLoss(LossModule):
     def _rgb_loss(self, masks, pixels, *states) -> torch.Tensor:
         steps = pixels.shape[1]
         if self.rgb_steps is not None and self.rgb_steps < steps:
-            index = torch.randperm(steps, device=pixels.device)[: self.rgb_steps]
+            index = torch.randperm(steps, generator=self.generator, device=pixels.device)[: self.rgb_steps]
             masks, pixels, states = masks[:, index], pixels[:, index], [s[:, index] for s in states]
         blocks = self.world_model.image_decoder.decode_blocks(*states).flatten(0, 1)
         target = to_blocks(pixels.flatten(0, 1)).to(blocks.dtype) * (1 / 255) - 0.5

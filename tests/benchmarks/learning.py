@@ -13,43 +13,54 @@ from dynmap_rl.envs.world import EPISODE_STEPS
 from dynmap_rl.evaluation import roll_out, scene_seeds
 from dynmap_rl.modules import Actor, WorldModel, make_policy, make_world_model, mixed_precision
 from dynmap_rl.objectives.world_model import WorldModelLoss, rms
-from dynmap_rl.training import make_optimizer, step
+from dynmap_rl.parts import differentiate, map_in_threads, split_batch
+from dynmap_rl.training import descend, make_optimizer
 
 SUPERVISION = ("position", "velocity")
 
 
-def world_model_training(dataset: str, decode_all: bool = True, count: int = 16, steps: int = 24) -> dict:
+def world_model_training(
+    dataset: str, decode_all: bool = True, count: int = 16, steps: int = 24, updates: int = 3
+) -> dict:
     """Frames a second of a training step of ``recipes/decoupled.py``, against the same model in plain float32 with
     LSTM cells in a time loop, which decodes every frame (or as many as the recipe does)."""
     torch.set_num_threads(2)
     episodes = data.load_dataset(dataset, "train")
     constants = data.load_meta(dataset)["normalization"]
-    generator = torch.Generator().manual_seed(0)
-    windows = data.sample_windows(episodes, count, steps, generator)
+    windows = data.sample_windows(episodes, count, steps, torch.Generator().manual_seed(0))
     fast = make_world_model(constants, SUPERVISION).to(memory_format=torch.channels_last)
-    loss_module = WorldModelLoss(fast, rgb_steps=8)
+    sizes = split_batch(count, torch.device("cpu"))
+    halves = windows.split(sizes)
+    loss_modules = [WorldModelLoss(fast, rgb_steps=8, generator=torch.Generator()) for _ in sizes]
     optimizer = make_optimizer(fast, 1e-4, 1e-4)
+
+    def find_losses(part: int) -> dict[str, torch.Tensor]:
+        with mixed_precision("cpu"):
+            losses = loss_modules[part](halves[part])
+        return {name: value * (sizes[part] / count) for name, value in losses.items()}
 
     def ours():
         def run():
-            with mixed_precision("cpu"):
-                losses = loss_module(windows)
-            step(sum(losses.values()), optimizer)
+            with map_in_threads(len(sizes)) as map_parts:
+                for _ in range(updates):
+                    differentiate(find_losses, range(len(sizes)), list(fast.parameters()), map_parts)
+                    descend(optimizer)
 
-        return count * steps / seconds(run)
+        return updates * count * steps / seconds(run)
 
     slow = PlainWorldModel(make_world_model(constants, SUPERVISION))
     plain_optimizer = torch.optim.AdamW(slow.parameters(), 1e-4)
 
     def plain():
         def run():
-            loss = slow.loss(windows, None if decode_all else 8)
-            plain_optimizer.zero_grad()
-            loss.backward()
-            nn.utils.clip_grad_norm_(slow.parameters(), 1.0)
-            plain_optimizer.step()
+            for _ in range(updates):
+                loss = slow.loss(windows, None if decode_all else 8)
+                plain_optimizer.zero_grad()
+                loss.backward()
+                nn.utils.clip_grad_norm_(slow.parameters(), 1.0)
+                plain_optimizer.step()
 
-        return count * steps / seconds(run)
+        return updates * count * steps / seconds(run)
 
     return compare(ours, plain, repeats=7)
 

@@ -20,7 +20,7 @@ from dynmap_rl.envs import DynmapBatchedEnv
 from dynmap_rl.evaluation import scene_seeds
 from dynmap_rl.integrations.lerobot import DynmapConfig, DynmapEnvConfig
 from dynmap_rl.integrations.lerobot.modeling_dynmap import DynmapPolicy
-from dynmap_rl.training import fingerprint
+from dynmap_rl.weights import fingerprint
 
 TASKS = ("balance_reaching", "balance_reaching_obstacle", "bin_dropping")
 SMALL = {"device": "cpu", "push_to_hub": False, "window_steps": 6, "rgb_steps": 2}

@@ -15,7 +15,7 @@ from dynmap_rl.integrations.lerobot import (
 )
 from dynmap_rl.integrations.lerobot.modeling_dynmap import DynmapPolicy
 from dynmap_rl.runs import read_json, write_json
-from dynmap_rl.training import fingerprint
+from dynmap_rl.weights import fingerprint
 
 
 def make_run(folder, kind, keypoints=False, goal=2):

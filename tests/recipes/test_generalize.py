@@ -8,7 +8,7 @@ from safetensors.torch import load_file, save_file
 from dynmap_rl.data import load_meta
 from dynmap_rl.frozen import load_source
 from dynmap_rl.runs import read_json, write_json
-from dynmap_rl.training import fingerprint
+from dynmap_rl.weights import fingerprint
 from recipes.generalize import Config, main
 
 
