@@ -1,6 +1,6 @@
 """Policies on a frozen world model, what decoupled training and generalisation share (paper, Sec. III-B and V-D).
 
-The world model's states are computed once; every policy seed is then trained and judged in a process of its own,
+The world model's states are computed once; every policy seed is then trained, and judged, in a process of its own,
 and the weights of the world model are shown to be the same before and after.
 """
 
@@ -20,6 +20,7 @@ from dynmap_rl.modules import Actor, WorldModel
 from dynmap_rl.training import train_policy
 from dynmap_rl.weights import fingerprint
 
+TRAINED = "trained.json"  # written when a policy is: on which world model
 TRAININGS = ["decoupled", "joint", "end_to_end"]
 
 
@@ -94,7 +95,7 @@ def train_policies(
             for name, values in (("train", features), ("eval", held_out)):
                 values.cpu().memmap(folder / "features" / name)
             arguments = [(settings, folder, constants, seed, frozen) for seed in todo]
-            runs.run_processes(_train_and_evaluate, arguments, settings.threads)
+            runs.run_processes([_train, _evaluate], arguments, settings.threads)
         finally:
             shutil.rmtree(folder / "features", ignore_errors=True)
     if fingerprint(modules.load_world_model(folder / "world_model")) != frozen:
@@ -108,19 +109,34 @@ def check_space(folder: Path, size: int) -> None:
         raise OSError(errno.ENOSPC, f"{size / 1e6:.0f} MB are needed, {free / 1e6:.0f} are free", str(folder))
 
 
-def _train_and_evaluate(arguments: tuple) -> None:
-    """One policy seed: train, evaluate, and prove that the world model stayed as it was."""
+def _train(arguments: tuple) -> None:
+    """One policy seed, unless it is trained already."""
     settings, folder, constants, seed, frozen = arguments
+    path = folder / f"seed_{seed}"
+    if (path / TRAINED).exists() and runs.read_json(path / TRAINED) == {"world_model_sha256": frozen}:
+        return
+    torch.set_num_threads(1)
+    runs.seed_everything(1000 + seed)
+    device = runs.choose_device(settings.device)
+    world_model = modules.load_world_model(folder / "world_model")
+    policy = modules.make_policy(constants, settings.policy, world_model).to(device)
+    features = TensorDict.load_memmap(folder / "features" / "train")
+    held_out = TensorDict.load_memmap(folder / "features" / "eval")
+    train_policy(policy, features, held_out, path, settings, seed)
+    modules.save_policy(path / "policy", policy, world_model)
+    runs.write_json(path / TRAINED, {"world_model_sha256": frozen})
+
+
+def _evaluate(arguments: tuple) -> None:
+    """Judge a trained policy, and prove that the world model stayed as it was."""
+    settings, folder, _, seed, frozen = arguments
     torch.set_num_threads(1)
     runs.seed_everything(1000 + seed)
     device = runs.choose_device(settings.device)
     world_model = modules.load_world_model(folder / "world_model").requires_grad_(False).to(device)
-    policy = modules.make_policy(constants, settings.policy, world_model).to(device)
-    features = TensorDict.load_memmap(folder / "features" / "train")
-    held_out = TensorDict.load_memmap(folder / "features" / "eval")
-    train_policy(policy, features, held_out, folder / f"seed_{seed}", settings, seed)
-    modules.save_policy(folder / f"seed_{seed}" / "policy", policy, world_model)
+    policy = modules.load_policy(folder / f"seed_{seed}" / "policy").to(device)
     if settings.task == NO_TASK:
+        held_out = TensorDict.load_memmap(folder / "features" / "eval")
         result = {"held_out": policy_errors(policy, held_out)}
     else:
         episodes = settings.test_episodes, settings.paper_episodes

@@ -38,7 +38,7 @@ def train_seeds(
     """
     todo = [seed for seed in seeds if not (folder / f"seed_{seed}" / "eval.json").exists()]
     arguments = [(dataset, supervision, folder, settings, seed, end_to_end) for seed in todo]
-    runs.run_processes(_train_and_evaluate, arguments, settings.threads)
+    runs.run_processes([_train_and_evaluate], arguments, settings.threads)
 
 
 def _train_and_evaluate(arguments: tuple) -> None:

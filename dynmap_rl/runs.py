@@ -15,8 +15,8 @@ import os
 import random
 import signal
 import threading
-from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -231,22 +231,33 @@ def seed_everything(seed: int) -> None:
     torch.manual_seed(seed)
 
 
-def run_processes(work: Callable[[tuple], None], arguments: list[tuple], count: int) -> None:
-    """``count`` at a time, each in a process of its own; one at a time, or one alone, in this one.
+def run_processes(stages: Sequence[Callable[[tuple], None]], arguments: list[tuple], count: int) -> None:
+    """Every stage of each argument, ``count`` at a time, each in a process of its own; one at a time, or one alone, in
+    this one. A stage waits until the one before is done for this argument, and for the first stages of all.
 
     Raises:
         OSError: a process died.
     """
     if min(count, len(arguments)) <= 1:
         for one in arguments:
-            work(one)
+            for stage in stages:
+                stage(one)
         return
     context = multiprocessing.get_context("spawn")
-    try:
-        with ProcessPoolExecutor(count, mp_context=context, initializer=start_worker) as pool:
-            list(pool.map(work, arguments))
-    except BrokenProcessPool as error:
-        raise OSError("a process died (of memory?); the same command goes on") from error
+    with ProcessPoolExecutor(count, mp_context=context, initializer=start_worker) as pool:
+        try:
+            running = {pool.submit(stages[0], one): (one, stages[1:]) for one in arguments}
+            while running:
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    one, later = running.pop(future)
+                    future.result()
+                    if later:
+                        running[pool.submit(later[0], one)] = one, later[1:]
+        except BrokenProcessPool as error:
+            raise OSError("a process died (of memory?); the same command goes on") from error
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
 
 
 def start_worker() -> None:

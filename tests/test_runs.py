@@ -1,5 +1,6 @@
 """Run folders: nothing is lost by a kill, nothing damaged is read in silence."""
 
+import importlib
 import subprocess
 import sys
 from dataclasses import dataclass, replace
@@ -126,3 +127,52 @@ def test_seeding_covers_every_generator():
         return random.random(), np.random.rand(), torch.rand(1).item()
 
     assert draw() == draw()
+
+
+STAGES = """
+import os
+
+def first(argument):
+    folder, number = argument
+    (folder / f"first_{number}").touch()
+
+def second(argument):
+    folder, number = argument
+    assert (folder / f"first_{number}").exists()
+    if number == 1:
+        raise ValueError("this one fails")
+    (folder / f"second_{number}").touch()
+
+def third(argument):
+    os._exit(1)
+"""
+
+
+@pytest.fixture
+def stages(tmp_path, monkeypatch):
+    """Of a module that other processes can import."""
+    (tmp_path / "stages").mkdir()
+    (tmp_path / "stages" / "some_stages.py").write_text(STAGES)
+    monkeypatch.syspath_prepend(tmp_path / "stages")
+    yield importlib.import_module("some_stages")
+    del sys.modules["some_stages"]
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_every_stage_follows_the_one_before(tmp_path, stages, count):
+    (tmp_path / "out").mkdir()
+    numbers = 0, 2, 3
+    runs.run_processes([stages.first, stages.second], [(tmp_path / "out", n) for n in numbers], count)
+    names = {p.name for p in (tmp_path / "out").iterdir()}
+    assert names == {f"{stage}_{n}" for stage in ("first", "second") for n in numbers}
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_what_goes_wrong_in_a_process_is_raised(tmp_path, stages, count):
+    with pytest.raises(ValueError, match="this one fails"):
+        runs.run_processes([stages.first, stages.second], [(tmp_path, n) for n in range(4)], count)
+
+
+def test_a_process_that_dies_is_an_error(tmp_path, stages):
+    with pytest.raises(OSError, match="a process died"):
+        runs.run_processes([stages.first, stages.third], [(tmp_path, 0), (tmp_path, 1)], 2)

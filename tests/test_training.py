@@ -131,9 +131,10 @@ def test_a_frozen_world_model_that_changes_stops_the_run(tmp_path, monkeypatch, 
     """One weight, on the disk, after the policy of a seed is finished: the first, or the last."""
     weights = tmp_path / "world_model/weights.safetensors"
 
-    def work_and_tamper(work, arguments, count):
+    def work_and_tamper(stages, arguments, count):
         for number, one in enumerate(arguments):
-            work(one)
+            for stage in stages:
+                stage(one)
             if number == seed:
                 state = load_file(weights)
                 next(iter(state.values())).view(-1)[0] += 1e-6
@@ -147,6 +148,32 @@ def test_a_frozen_world_model_that_changes_stops_the_run(tmp_path, monkeypatch, 
         frozen.train_policies(make_model(), episodes, CONSTANTS, tmp_path, settings, [0, 1])
     assert (tmp_path / f"seed_{seed}/eval.json").exists()
     assert (tmp_path / "seed_1/eval.json").exists() is (seed == 1)
+
+
+def test_a_policy_that_is_trained_is_judged_without_training_it_again(tmp_path, monkeypatch):
+    sizes = {"copies": 1, "test_episodes": 1, "paper_episodes": 1, "split": "validation", "threads": 1}
+    settings = SimpleNamespace(task="balance_reaching", policy="feedforward", **sizes, **vars(SETTINGS))
+    episodes = dict.fromkeys(("train", "eval"), make_episodes())
+
+    def train(model):
+        return frozen.train_policies(model, episodes, CONSTANTS, tmp_path, settings, [0])
+
+    def stop(*args):
+        raise Stop
+
+    with monkeypatch.context() as patched, pytest.raises(Stop):
+        patched.setattr(frozen, "evaluate", stop)
+        train(make_model())
+    with monkeypatch.context() as patched:
+        patched.setattr(frozen, "train_policy", stop)
+        sha = train(make_model())
+        assert runs.read_json(tmp_path / "seed_0/eval.json")["world_model_sha256"] == sha
+        (tmp_path / "seed_0/eval.json").unlink()
+        other = make_model()
+        with torch.no_grad():
+            next(other.parameters()).add_(1e-3)
+        with pytest.raises(Stop):
+            train(other)
 
 
 def test_bfloat16_is_only_for_processors_that_compute_with_it(monkeypatch):
