@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable
 
 import numpy as np
@@ -120,58 +121,63 @@ class DynmapBatchedEnv(EnvBase):
                 f"scene_seed must have one seed for each of {n} worlds, not {shape}; "
                 "a ParallelEnv takes those of its processes as list_of_kwargs"
             )
-        for i in mask.nonzero().flatten().tolist():
+        rows = mask.nonzero().flatten().tolist()
+        for i in rows:
             seed = int(seeds[i]) if seeds is not None else int(self.rng.integers(2**63))
             scene = self.task.sample_scene(np.random.default_rng(seed), self.ranges)
             self.worlds[i] = self.task.make_world(scene)
-        return self._observe().update(self._done())
+        # What was last seen is kept apart from what callers get, who may change it.
+        if len(rows) == n:
+            self._seen = self._observe(self.worlds)
+        elif rows:
+            self._seen[mask.to(self.device)] = self._observe([self.worlds[i] for i in rows])
+        return self._seen.clone()
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         actions = tensordict["action"].detach().cpu().numpy()
         if self.control == "acceleration":
             actions = [world.action_for(a) for world, a in zip(self.worlds, actions, strict=True)]
-        step_worlds(self.worlds, actions)
-        reward = self._column(self.task.reward(world) for world in self.worlds)
-        return self._observe().update(self._done()).set("reward", reward)
+        step_worlds(self.worlds, actions, torch.get_num_threads())
+        self._seen = self._observe(self.worlds)
+        reward = torch.tensor([[self.task.reward(world)] for world in self.worlds], dtype=torch.float32)
+        return self._seen.clone().set("reward", reward.to(self.device))
 
-    def _observe(self) -> TensorDict:
-        worlds, task = self.worlds, self.task
-        names = ("position", "velocity", "acceleration")
-        commanded = self._stack(w.commanded for w in worlds)
-        goals = self._stack(task.goal(w) for w in worlds)
+    def _observe(self, worlds: list[World]) -> TensorDict:
+        """What is to be seen of some of the worlds, and which of them are done."""
+        task = self.task
+        # Entries are columns of few arrays, as many small arrays take longer.
+        vectors = ((w.commanded, task.goal(w), w.position, w.velocity, w.acceleration) for w in worlds)
+        rows = _rows(itertools.chain.from_iterable(vectors), len(worlds))
+        flags = np.array([self._flags(w) for w in worlds], dtype=bool)
+        flags = dict(
+            zip((*EVENTS, "terminated", "truncated"), torch.from_numpy(flags).split(1, 1), strict=True)
+        )
+        dynamics = zip(("position", "velocity", "acceleration"), rows[:, -18:].split(6, 1), strict=True)
         data = {
-            "agent_pos": torch.cat([commanded, goals], 1),
-            "goal": goals,
-            "dynamics": {k: self._stack(getattr(w, k) for w in worlds) for k in names},
-            "position_error": self._column(w.position_error for w in worlds),
-            "dropped": self._flag(w.dropped for w in worlds),
-            "touched": self._flag(bool(w.touched) for w in worlds),
-            "is_success": self._flag(task.is_success(w) for w in worlds),
+            "agent_pos": rows[:, :-18],
+            "goal": rows[:, 3:-18],
+            "dynamics": dict(dynamics),
+            "position_error": torch.tensor([[w.position_error] for w in worlds], dtype=torch.float32),
+            "done": flags["terminated"] | flags["truncated"],
+            **flags,
         }
         if not self.pixels_only:
-            data["state"] = self._stack(task.state(w) for w in worlds)
+            data["state"] = _rows((task.state(w) for w in worlds), len(worlds))
         if self.renderer:
             frames = np.stack([self.renderer.draw(w, task) for w in worlds])
-            data["pixels"] = torch.from_numpy(frames).permute(0, 3, 1, 2).to(self.device)
-        return TensorDict(data, batch_size=self.batch_size, device=self.device)
+            data["pixels"] = torch.from_numpy(frames).permute(0, 3, 1, 2)
+        return TensorDict(data, batch_size=[len(worlds)], device=self.device)
 
-    def _done(self) -> dict[str, torch.Tensor]:
-        terminated = self._flag(self.task.is_over(w) for w in self.worlds)
-        truncated = self._flag(w.steps >= EPISODE_STEPS for w in self.worlds)
-        return {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
+    def _flags(self, world: World) -> tuple[bool, ...]:
+        task = self.task
+        ended = task.is_over(world), world.steps >= EPISODE_STEPS
+        return world.dropped, bool(world.touched), task.is_success(world), *ended
 
-    def _flag(self, values: Iterable[bool]) -> torch.Tensor:
-        """``[N, 1]``"""
-        return torch.tensor(list(values), device=self.device).unsqueeze(1)
 
-    def _stack(self, rows: Iterable[np.ndarray]) -> torch.Tensor:
-        """Vectors as float32 ``[N, ...]``; three times as fast as ``np.stack``."""
-        array = np.concatenate(list(rows), dtype=np.float32, casting="same_kind")
-        return torch.from_numpy(array.reshape(len(self.worlds), -1)).to(self.device)
-
-    def _column(self, values: Iterable[float]) -> torch.Tensor:
-        """float32 ``[N, 1]``"""
-        return torch.tensor(list(values), dtype=torch.float32, device=self.device).unsqueeze(1)
+def _rows(vectors: Iterable[np.ndarray], count: int) -> torch.Tensor:
+    """Vectors, one after the other, as float32 ``[count, ...]``; three times as fast as ``np.stack``."""
+    array = np.concatenate(list(vectors), dtype=np.float32, casting="same_kind")
+    return torch.from_numpy(array.reshape(count, -1))
 
 
 def _any_scene(env: DynmapBatchedEnv):

@@ -70,7 +70,8 @@ def play(
         yield worlds
         state = np.stack([(states or task).state(world) for world in worlds])
         mean, _ = network(torch.from_numpy(state))
-        step_worlds(worlds, [world.action_for(a) for world, a in zip(worlds, mean.numpy(), strict=True)])
+        actions = [world.action_for(a) for world, a in zip(worlds, mean.numpy(), strict=True)]
+        step_worlds(worlds, actions, torch.get_num_threads())
 
 
 def roll_out(
