@@ -44,7 +44,7 @@ class Config:
     eval_episodes: int = 200
     # Fresh scenes for the last checkpoint.
     final_episodes: int = 1000
-    # Torch's threads.
+    # Threads that simulate, and in which the two networks learn; they change no bit.
     threads: int = 2
     # Metrics to tensorboard, wandb or trackio as well, where it is installed.
     logger: str | None = None
@@ -63,8 +63,8 @@ def main(config: Config) -> None:
 
     check_logger(config.logger)
     check_at_least_one(config, *POSITIVE)
-    torch.set_num_threads(config.threads)
-    env = DynmapBatchedEnv(config.task, config.num_envs, control="acceleration")
+    torch.set_num_threads(1)  # more take longer to wait for each other than these networks do to compute
+    env = DynmapBatchedEnv(config.task, config.num_envs, control="acceleration", threads=config.threads)
     folder = runs.open_run(
         config.run or Path("runs/expert") / env.task.name,
         config,

@@ -42,6 +42,7 @@ class DynmapBatchedEnv(EnvBase):
         ranges: what scenes are drawn from; by default the task's own.
         seed: of the scenes.
         pixels_only: leave ``state`` out, which takes time to compute and no policy on pixels may see.
+        threads: among which worlds are divided, which changes no bit; by default as many as torch then has.
     """
 
     batch_locked = True
@@ -56,6 +57,7 @@ class DynmapBatchedEnv(EnvBase):
         seed: int | None = None,
         device: torch.device | str = "cpu",
         pixels_only: bool = False,
+        threads: int | None = None,
     ):
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
@@ -69,6 +71,7 @@ class DynmapBatchedEnv(EnvBase):
         self.ranges = choose_ranges(self.task.ranges, ranges)
         self.renderer = Renderer() if from_pixels else None
         self.pixels_only = pixels_only
+        self.threads = threads
         self.worlds: list[World | None] = [None] * num_envs
         self._make_specs()
         self.set_seed(seed)
@@ -137,7 +140,7 @@ class DynmapBatchedEnv(EnvBase):
         actions = tensordict["action"].detach().cpu().numpy()
         if self.control == "acceleration":
             actions = [world.action_for(a) for world, a in zip(self.worlds, actions, strict=True)]
-        step_worlds(self.worlds, actions, torch.get_num_threads())
+        step_worlds(self.worlds, actions, self.threads or torch.get_num_threads())
         self._seen = self._observe(self.worlds)
         reward = torch.tensor([[self.task.reward(world)] for world in self.worlds], dtype=torch.float32)
         return self._seen.clone().set("reward", reward.to(self.device))

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import torch
 from tensordict import TensorDictBase
+from torch.nn.functional import smooth_l1_loss
 from torchrl.envs import EnvBase
 from torchrl.modules import MLP, IndependentNormal, ValueOperator
 from torchrl.objectives import ClipPPOLoss
@@ -46,7 +48,7 @@ def train_ppo(
         folder: run folder; gets ``metrics.jsonl`` and, in ``checkpoint``, ``iteration_NNN`` as safetensors and JSON
             every ``checkpoint_every`` iterations, and the training state.
         settings: with ``seed``, ``iterations``, ``epochs``, ``minibatch``, ``learning_rate``, ``gamma``,
-            ``gae_lambda``, ``clip``, ``entropy``, ``checkpoint_every``, ``eval_episodes`` and ``final_episodes``.
+            ``gae_lambda``, ``clip``, ``entropy``, ``checkpoint_every``, ``eval_episodes``, ``final_episodes`` and ``threads``.
         judge: rates of the network's mean action on so many fresh scenes, at least ``success`` and ``drop``.
         facts: about the run, written to the JSON of each checkpoint with what ``judge`` says.
 
@@ -61,20 +63,20 @@ def train_ppo(
     advantage = GAE(
         gamma=settings.gamma, lmbda=settings.gae_lambda, value_network=critic, average_gae=True, shifted=True
     )
-    loss_module = ClipPPOLoss(
+    policy_loss = ClipPPOLoss(
         actor,
-        critic,
         clip_epsilon=settings.clip,
         entropy_coeff=settings.entropy,
-        critic_coeff=1.0,
-        functional=False,  # no other parameters than its own are ever put in, which takes a fourth of the time
+        critic_coeff=None,  # `update` does it, at the same time
+        functional=False,  # which would put parameters in and out, a fourth of the time
     )
-    optimizer = torch.optim.Adam(loss_module.parameters(), settings.learning_rate, eps=1e-5, fused=True)
+    networks = torch.nn.ModuleList([network, critic])
+    optimizer = torch.optim.Adam(networks.parameters(), settings.learning_rate, eps=1e-5, fused=True)
 
     start, seconds = 0, 0.0
     state_path = folder / "checkpoint" / "training_state.pt"
     if state := runs.load_training_state(state_path):
-        loss_module.load_state_dict(state["loss_module"])
+        networks.load_state_dict(state["networks"])
         optimizer.load_state_dict(state["optimizer"])
         start, seconds = state["iteration"], state["seconds"]
     runs.truncate_metrics(folder, start)
@@ -91,7 +93,7 @@ def train_ppo(
         for group in optimizer.param_groups:
             group["lr"] = settings.learning_rate * (1 - 0.9 * iteration / settings.iterations)
         batch = collect(env, network)
-        losses = update(batch, loss_module, advantage, optimizer, settings.epochs, settings.minibatch)
+        losses = update(batch, policy_loss, critic, advantage, optimizer, settings)
         done = batch["next", "done"].squeeze(-1)
         seconds += time.perf_counter() - began
         metrics = {
@@ -116,7 +118,7 @@ def train_ppo(
             )
         runs.save_training_state(
             state_path,
-            loss_module=loss_module.state_dict(),
+            networks=networks.state_dict(),
             optimizer=optimizer.state_dict(),
             iteration=iteration + 1,
             seconds=seconds,
@@ -137,23 +139,42 @@ def collect(env: EnvBase, network: ExpertNetwork) -> TensorDictBase:
 
 
 def update(
-    batch: TensorDictBase, loss_module: ClipPPOLoss, advantage: GAE, optimizer, epochs: int, minibatch: int
+    batch: TensorDictBase,
+    policy_loss: ClipPPOLoss,
+    critic: ValueOperator,
+    advantage: GAE,
+    optimizer,
+    settings,
 ) -> dict[str, float]:
     """PPO's epochs of minibatches over one batch ``[N, T]``; ``ValueError`` where a loss is not finite."""
     with torch.no_grad():
         batch = advantage(batch)
     batch = batch.select("state", "action", "action_log_prob", "advantage", "value_target").reshape(-1)
-    for _ in range(epochs):
-        for part in batch[torch.randperm(len(batch))].split(minibatch):
-            losses = loss_module(part)
-            loss = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
-            optimizer.zero_grad()
-            loss.backward()
-            norm = torch.nn.utils.clip_grad_norm_(loss_module.parameters(), 0.5)
-            optimizer.step()
+    parameters = [p for group in optimizer.param_groups for p in group["params"]]
+
+    def learn_values(part: TensorDictBase) -> torch.Tensor:
+        loss = smooth_l1_loss(critic.module(part["state"]), part["value_target"])
+        loss.backward()
+        return loss.detach()
+
+    def learn_actions(part: TensorDictBase) -> TensorDictBase:
+        losses = policy_loss(part)
+        (losses["loss_objective"] + losses["loss_entropy"]).backward()
+        return losses.detach()
+
+    # The two networks have nothing in common: each learns in a thread of its own, where there are two.
+    with ThreadPoolExecutor(1) as other:
+        for _ in range(settings.epochs):
+            for part in batch[torch.randperm(len(batch))].split(settings.minibatch):
+                optimizer.zero_grad()
+                values = other.submit(learn_values, part) if settings.threads > 1 else None
+                losses = learn_actions(part)
+                losses["loss_critic"] = values.result() if values else learn_values(part)
+                norm = torch.nn.utils.clip_grad_norm_(parameters, 0.5)
+                optimizer.step()
     # Weights that are not finite stay so: the last loss tells. Nor is there a first loss to compare with: the critic's
     # rises with the returns, in a good run fivefold.
-    check_loss(loss.item(), norm)
+    check_loss((losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]).item(), norm)
     return {k: losses[k].item() for k in ("loss_objective", "loss_critic", "entropy")}
 
 

@@ -1,6 +1,7 @@
 """The compiled substeps are the plain loop, bit by bit, and the plain loop stands in where they cannot be compiled."""
 
 import builtins
+import multiprocessing
 import sys
 
 import numpy as np
@@ -37,15 +38,16 @@ def test_compiled_equals_plain(name, monkeypatch):
     assert touched or name == "balance_reaching"  # and callbacks called
 
 
+@pytest.mark.parametrize("threads", [1, 2, 3])
 @pytest.mark.parametrize("name", TASKS)
-def test_many_worlds_at_once_move_as_each_alone(name):
+def test_many_worlds_at_once_move_as_each_alone(name, threads):
     task, count = TASKS[name], 12
     scenes = [task.sample_scene(np.random.default_rng(seed)) for seed in range(count)]
     alone, together = ([task.make_world(scene) for scene in scenes] for _ in range(2))
     rng = np.random.default_rng(0)
     for _ in range(60):
         actions = rng.normal(size=(count, 3)) * (0.01, 0.01, 0.03)
-        world.step_worlds(together, actions)
+        world.step_worlds(together, actions, threads)
         for simulated, action in zip(alone, actions, strict=True):
             simulated.step(action)
     for a, b in zip(alone, together, strict=True):
@@ -53,6 +55,18 @@ def test_many_worlds_at_once_move_as_each_alone(name):
             assert getattr(a, attribute).tobytes() == getattr(b, attribute).tobytes()
         assert (a.steps, a.dropped, a.touched, a.errors) == (b.steps, b.dropped, b.touched, b.errors)
     assert any(w.dropped for w in together), "contacts were seen to break"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no process forks there")
+@pytest.mark.filterwarnings("ignore:.*use of fork")
+def test_a_forked_process_has_threads_of_its_own():
+    worlds = [TASKS["bin_dropping"].make_world(TASKS["bin_dropping"].ranges.scene()) for _ in range(8)]
+    actions = np.zeros((8, 3))
+    world.step_worlds(worlds, actions, threads=2)
+    child = multiprocessing.get_context("fork").Process(target=world.step_worlds, args=(worlds, actions, 2))
+    child.start()
+    child.join(30)
+    assert child.exitcode == 0
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="known to compile on Linux")

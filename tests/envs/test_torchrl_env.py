@@ -118,6 +118,17 @@ def test_partial_reset_touches_only_the_masked_worlds(task):
     assert (after["dynamics", "velocity"][1] == 0).all()
 
 
+def test_partial_reset_shows_the_other_worlds_as_they_are():
+    """Whatever callers have done to what was last seen of them; ``_reset`` is what TorchRL's wrappers call."""
+    env = DynmapBatchedEnv(num_envs=3, seed=0)
+    env.step(env.rand_action(env.reset()))["next"].apply_(torch.Tensor.zero_)
+    after = env._reset(TensorDict({"_reset": torch.tensor([[False], [True], [False]])}, [3]))
+    assert [world.steps for world in env.worlds] == [1, 0, 1]
+    for seen, world in zip(after, env.worlds, strict=True):
+        np.testing.assert_array_equal(seen["state"], env.task.state(world))
+        np.testing.assert_array_equal(seen["dynamics", "position"], world.position.astype(np.float32))
+
+
 def test_seed_determines_every_scene_that_follows():
     def goals(env, seed):
         env.set_seed(seed)

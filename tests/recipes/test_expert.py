@@ -83,6 +83,13 @@ def test_killed_run_resumes_to_the_same_weights(finished, tmp_path, monkeypatch,
     assert all(torch.equal(resumed[k], expected[k]) for k in expected)
 
 
+def test_threads_change_no_weight(finished, tmp_path):
+    main(tiny(tmp_path, threads=2))
+    assert metrics(tmp_path) == metrics(finished)
+    name = "checkpoint/iteration_002.safetensors"
+    assert (tmp_path / name).read_bytes() == (finished / name).read_bytes()
+
+
 def test_finished_run_is_left_alone(finished, capsys):
     files = {p: p.read_bytes() for p in finished.rglob("*") if p.is_file()}
     main(tiny(finished))
