@@ -38,6 +38,10 @@ ROWS = {
     "frame": ("control step with 64x64 frame", "the same without", "us", US, "<= 1.25", simulation.frame),
     "pusht": ("frames/s with pixels", "gym-pusht `pixels`", "1/s", 1, ">= 10", simulation.pusht),
     "batch": ("batched environment, a step of 64 worlds", "the worlds alone", "ms", MS, "<= 1.1", simulation.batch),
+    "batch_threads": (
+        "the same, its worlds on two threads", "the worlds alone, on one", "ms", MS, "",
+        lambda **sizes: simulation.batch(**sizes, threads=2),
+    ),
     "processes": ("two processes of 64 worlds", "one", "steps/s", 1, ">= 1.8", simulation.processes),
     "ppo": ("PPO, time to 97 % success", "Stable-Baselines3 on our Gymnasium id", "s", 1, "<= 0.33", ppo.ppo),
     "training": (

@@ -99,12 +99,13 @@ def pusht() -> dict | None:
     return compare(ours, theirs, repeats=5)
 
 
-def batch(num_envs: int = 64, steps: int = 60) -> dict:
-    """The batched TorchRL environment against its worlds alone, a control step of all of them."""
+def batch(num_envs: int = 64, steps: int = 60, threads: int = 1) -> dict:
+    """The batched TorchRL environment against its worlds alone, on one core, a control step of all of them."""
+    torch.set_num_threads(1)
     actions = np.stack([smooth_actions(i, steps) for i in range(num_envs)], 1).astype(np.float32)
 
     def ours():
-        env = DynmapBatchedEnv(num_envs=num_envs, seed=0)
+        env = DynmapBatchedEnv(num_envs=num_envs, seed=0, threads=threads)
         td, tensors = env.reset(scene_seed=torch.arange(num_envs)), torch.from_numpy(actions)
 
         def run():
