@@ -11,9 +11,9 @@ import torch
 from tensordict import TensorDictBase
 from torch.nn.functional import smooth_l1_loss
 from torchrl.envs import EnvBase
-from torchrl.modules import MLP, IndependentNormal
+from torchrl.modules import MLP, IndependentNormal, ValueOperator
 from torchrl.objectives import ClipPPOLoss
-from torchrl.objectives.value.functional import vec_generalized_advantage_estimate
+from torchrl.objectives.value import GAE
 from tqdm import tqdm
 
 from dynmap_rl import runs
@@ -57,7 +57,12 @@ def train_ppo(
     """
     inputs, width = network.mlp[0].in_features, network.mlp[0].out_features
     actor = make_actor(network)
-    critic = MLP(inputs, 1, num_cells=[width, width], activation_class=torch.nn.Tanh)
+    critic = ValueOperator(
+        MLP(inputs, 1, num_cells=[width, width], activation_class=torch.nn.Tanh), in_keys=["state"]
+    )
+    advantage = GAE(
+        gamma=settings.gamma, lmbda=settings.gae_lambda, value_network=critic, average_gae=True, shifted=True
+    )
     policy_loss = ClipPPOLoss(
         actor,
         clip_epsilon=settings.clip,
@@ -88,7 +93,7 @@ def train_ppo(
         for group in optimizer.param_groups:
             group["lr"] = settings.learning_rate * (1 - 0.9 * iteration / settings.iterations)
         batch = collect(env, network)
-        losses = update(batch, policy_loss, critic, optimizer, settings)
+        losses = update(batch, policy_loss, critic, advantage, optimizer, settings)
         done = batch["next", "done"].squeeze(-1)
         seconds += time.perf_counter() - began
         metrics = {
@@ -136,17 +141,19 @@ def collect(env: EnvBase, network: ExpertNetwork) -> TensorDictBase:
 def update(
     batch: TensorDictBase,
     policy_loss: ClipPPOLoss,
-    critic: torch.nn.Module,
+    critic: ValueOperator,
+    advantage: GAE,
     optimizer,
     settings,
 ) -> dict[str, float]:
     """PPO's epochs of minibatches over one batch ``[N, T]``; ``ValueError`` where a loss is not finite."""
-    estimate_advantages(batch, critic, settings.gamma, settings.gae_lambda)
+    with torch.no_grad():
+        batch = advantage(batch)
     batch = batch.select("state", "action", "action_log_prob", "advantage", "value_target").reshape(-1)
     parameters = [p for group in optimizer.param_groups for p in group["params"]]
 
     def learn_values(part: TensorDictBase) -> torch.Tensor:
-        loss = smooth_l1_loss(critic(part["state"]), part["value_target"])
+        loss = smooth_l1_loss(critic.module(part["state"]), part["value_target"])
         loss.backward()
         return loss.detach()
 
@@ -169,16 +176,6 @@ def update(
     # rises with the returns, in a good run fivefold.
     check_loss((losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]).item(), norm)
     return {k: losses[k].item() for k in ("loss_objective", "loss_critic", "entropy")}
-
-
-@torch.no_grad()
-def estimate_advantages(batch: TensorDictBase, critic: torch.nn.Module, gamma: float, lmbda: float) -> None:
-    """Add ``value_target`` and, of mean 0 and deviation 1, ``advantage``, both ``[N, T, 1]``."""
-    values, following = critic(batch["state"]), critic(batch["next", "state"])
-    outcome = (batch["next", key] for key in ("reward", "done", "terminated"))
-    advantage, target = vec_generalized_advantage_estimate(gamma, lmbda, values, following, *outcome)
-    batch["value_target"] = target
-    batch["advantage"] = (advantage - advantage.mean()) / advantage.std().clamp_min(1e-4)
 
 
 def rates(task: BalanceReaching, worlds: Iterable[World]) -> dict[str, float]:

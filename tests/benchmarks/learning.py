@@ -20,7 +20,7 @@ SUPERVISION = ("position", "velocity")
 
 
 def world_model_training(
-    dataset: str, decode_all: bool = True, count: int = 16, steps: int = 24, updates: int = 3
+    dataset: str, decode_all: bool = True, count: int = 16, steps: int = 24, updates: int = 10
 ) -> dict:
     """Frames a second of a training step of ``recipes/decoupled.py``, against the same model in plain float32 with
     LSTM cells in a time loop, which decodes every frame (or as many as the recipe does)."""
@@ -62,7 +62,7 @@ def world_model_training(
 
         return updates * count * steps / seconds(run)
 
-    return compare(ours, plain, repeats=7)
+    return compare(ours, plain, repeats=5)
 
 
 class PlainWorldModel(nn.Module):
