@@ -88,7 +88,7 @@ def finished(folder: Path) -> dict[str, int]:
         if path.suffix == ".pt":
             state = torch.load(path, weights_only=True)
             found[name] = state["update"] if "update" in state else state["iteration"]
-        elif path.name == "eval.json" or path.parent.name == "results" or path.name == "episodes.json":
+        elif path.name in ("eval.json", "trained.json", "episodes.json") or path.parent.name == "results":
             found[name] = path.stat().st_mtime_ns
     return found
 
