@@ -53,7 +53,7 @@ def train_ppo(
         facts: about the run, written to the JSON of each checkpoint with what ``judge`` says.
 
     Raises:
-        ValueError: the loss is not finite; the last training state, from before, is kept.
+        ValueError: the loss is not finite; the last training state, from before, is kept. Or that is of an earlier release.
     """
     inputs, width = network.mlp[0].in_features, network.mlp[0].out_features
     actor = make_actor(network)
@@ -76,6 +76,8 @@ def train_ppo(
     start, seconds = 0, 0.0
     state_path = folder / "checkpoint" / "training_state.pt"
     if state := runs.load_training_state(state_path):
+        if "networks" not in state:
+            raise ValueError(f"{state_path} is of an earlier release; choose another --run")
         networks.load_state_dict(state["networks"])
         optimizer.load_state_dict(state["optimizer"])
         start, seconds = state["iteration"], state["seconds"]

@@ -1,5 +1,6 @@
 """The expert recipe: runs, resumes to the same weights, and answers mistakes with one line."""
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -88,6 +89,13 @@ def test_threads_change_no_weight(finished, tmp_path):
     assert metrics(tmp_path) == metrics(finished)
     name = "checkpoint/iteration_002.safetensors"
     assert (tmp_path / name).read_bytes() == (finished / name).read_bytes()
+
+
+def test_a_run_of_an_earlier_release_is_named(finished, tmp_path):
+    shutil.copytree(finished, tmp_path / "run")
+    runs.save_training_state(tmp_path / "run/checkpoint/training_state.pt", loss_module={}, iteration=1)
+    with pytest.raises(ValueError, match="training_state.pt is of an earlier release; choose another --run"):
+        main(tiny(tmp_path / "run"))
 
 
 def test_finished_run_is_left_alone(finished, capsys):
