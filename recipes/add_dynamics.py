@@ -12,7 +12,8 @@ import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynmap_rl.commands import refuse, run_recipe
+from dynmap_rl.utils.cli import refuse
+from dynmap_rl.utils.cli import run_recipe
 
 
 @dataclass
@@ -47,8 +48,9 @@ class Config:
 
 
 def main(config: Config) -> None:
-    from dynmap_rl.data import add_dynamics, parse_entries
-    from dynmap_rl.evaluation import write_dataset_page
+    from dynmap_rl.data.derive import add_dynamics
+    from dynmap_rl.data.derive import parse_entries
+    from dynmap_rl.reporting.dataset_page import write_dataset_page
 
     if not config.dataset or not config.output:
         raise ValueError("name the dataset with --dataset and the new folder with --output")

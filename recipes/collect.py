@@ -12,7 +12,7 @@ import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynmap_rl.commands import run_recipe
+from dynmap_rl.utils.cli import run_recipe
 
 
 @dataclass
@@ -36,9 +36,11 @@ class Config:
 
 
 def main(config: Config) -> None:
-    from dynmap_rl.data import META, push_dataset, record_dataset
+    from dynmap_rl.data.demonstrations import META
+    from dynmap_rl.data.format.hub import push_dataset
+    from dynmap_rl.data.recording.shards import record_dataset
     from dynmap_rl.envs.tasks import get_task
-    from dynmap_rl.evaluation import write_dataset_page
+    from dynmap_rl.reporting.dataset_page import write_dataset_page
 
     suffix = "" if config.kind == "demonstrations" else f"_{config.kind}"
     output = config.output or Path("datasets") / f"{get_task(config.task).name}{suffix}"

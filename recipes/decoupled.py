@@ -12,7 +12,9 @@ goes on where it was stopped, or says that it is done.
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynmap_rl.commands import refuse, replace_defaults, run_recipe
+from dynmap_rl.utils.cli import refuse
+from dynmap_rl.utils.cli import replace_defaults
+from dynmap_rl.utils.cli import run_recipe
 
 
 @dataclass
@@ -53,7 +55,7 @@ class Config:
     beta_z: float = 0.1
     # Weight of the loss of every supervised quantity (Eq. 5).
     beta_dynamics: float = 1.0
-    # Bars painted on the background of a window, at most (see dynmap_rl.data.add_distractors); 0 for none.
+    # Bars painted on the background of a window, at most (see dynmap_rl.data.augmentation.add_distractors); 0 for none.
     distractors: int = 3
     # Spatial-softmax keypoints beside the plain CNN's features (beyond the paper).
     keypoints: bool = False
@@ -96,10 +98,15 @@ SMOKE = {
 def main(config: Config) -> None:
     import torch
 
-    from dynmap_rl import frozen, modules, runs, settings
+    from dynmap_rl import frozen  # MODULE
+    from dynmap_rl import modules  # MODULE
+    from dynmap_rl import runs  # MODULE
+    from dynmap_rl import settings  # MODULE
     from dynmap_rl.envs.tasks import NO_TASK
-    from dynmap_rl.evaluation import parse_supervision, print_row, write_report
-    from dynmap_rl.training import train_world_model
+    from dynmap_rl.modules.supervision import parse_supervision
+    from dynmap_rl.reporting.run_page import print_row
+    from dynmap_rl.reporting.run_page import write_report
+    from dynmap_rl.training.world_model import train_world_model
 
     if config.world_model:
         refuse(config, WORLD_MODEL, "is of a world model's training, and that of --world_model is done")

@@ -15,7 +15,8 @@ import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynmap_rl.commands import command_line, run_recipe
+from dynmap_rl.utils.cli import command_line
+from dynmap_rl.utils.cli import run_recipe
 
 
 @dataclass
@@ -45,8 +46,8 @@ class Config:
 
 
 def main(config: Config) -> None:
-    from dynmap_rl.evaluation import write_html
-    from dynmap_rl.runs import write_json
+    from dynmap_rl.reporting.html import write_html
+    from dynmap_rl.utils.files import write_json
 
     if config.episodes < 1:
         raise ValueError(f"--episodes must be at least 1, not {config.episodes}")
@@ -70,9 +71,12 @@ def judge_policy(config: Config) -> tuple[Path, str, dict]:
     """The folder with an animation, the numbers as text, and the result: ``DR``, ``PE``, ``SR`` and what became of
     every episode."""
     from dynmap_rl.envs.tasks import get_task
-    from dynmap_rl.evaluation import evaluate, film_policy
-    from dynmap_rl.modules import find_run, load_actor, task_of_run
-    from dynmap_rl.runs import choose_device
+    from dynmap_rl.evaluation.protocol import evaluate
+    from dynmap_rl.reporting.media import film_policy
+    from dynmap_rl.runs.lookup import find_run
+    from dynmap_rl.runs.lookup import load_actor
+    from dynmap_rl.runs.lookup import task_of_run
+    from dynmap_rl.utils.devices import choose_device
 
     folder = find_run(config.policy)
     task = config.task or task_of_run(folder) or "balance_reaching"
@@ -100,7 +104,7 @@ def judge_policy(config: Config) -> tuple[Path, str, dict]:
 
 def load_lerobot(policy: str, instruction: str):
     try:
-        from dynmap_rl.integrations.lerobot import LeRobotActor
+        from dynmap_rl.integrations.lerobot.actor import LeRobotActor
     except ImportError as error:
         raise ValueError(
             f"{policy} is no run of ours; for a policy of LeRobot: pip install '.[lerobot]' ({error})"
@@ -110,11 +114,18 @@ def load_lerobot(policy: str, instruction: str):
 
 def judge_expert(config: Config) -> tuple[Path, str, dict]:
     """The folder with an animation, the numbers as text, and the result: ``rates`` and ``intervals`` (%)."""
-    from dynmap_rl.envs.geometry import path_is_blocked, way_from_start
+    from dynmap_rl.envs.geometry import path_is_blocked
+    from dynmap_rl.envs.geometry import way_from_start
     from dynmap_rl.envs.scene import ObstacleScene
     from dynmap_rl.envs.tasks import get_task
-    from dynmap_rl.evaluation import failures_first, scene_seeds, wilson
-    from dynmap_rl.experts import film, list_checkpoints, load_expert, roll_out, task_of_expert
+    from dynmap_rl.evaluation.rollout import failures_first
+    from dynmap_rl.evaluation.rollout import scene_seeds
+    from dynmap_rl.evaluation.statistics import wilson
+    from dynmap_rl.reporting.media import film
+    from dynmap_rl.experts.network import list_checkpoints
+    from dynmap_rl.experts.network import load_expert
+    from dynmap_rl.experts.network import roll_out
+    from dynmap_rl.experts.network import task_of_expert
 
     task = get_task(config.task or "balance_reaching")
     expert = config.expert or task.name

@@ -9,7 +9,9 @@ on the same folder resumes. To ship checkpoints with the package, copy them to `
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynmap_rl.commands import check_at_least_one, command_line, run_recipe
+from dynmap_rl.utils.cli import check_at_least_one
+from dynmap_rl.utils.cli import command_line
+from dynmap_rl.utils.cli import run_recipe
 
 
 @dataclass
@@ -53,13 +55,21 @@ class Config:
 def main(config: Config) -> None:
     import torch
 
-    from dynmap_rl import runs
-    from dynmap_rl.envs import DynmapBatchedEnv
+    from dynmap_rl import runs  # MODULE
+    from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
     from dynmap_rl.envs.world import ACCELERATION_LIMIT
-    from dynmap_rl.evaluation import failures_first, write_html
-    from dynmap_rl.experts import ExpertNetwork, film, list_checkpoints, roll_out
-    from dynmap_rl.experts.ppo import POSITIVE, fresh_scenes, rates, rates_text, train_ppo
-    from dynmap_rl.loggers import check_logger
+    from dynmap_rl.evaluation.rollout import failures_first
+    from dynmap_rl.reporting.html import write_html
+    from dynmap_rl.experts.network import ExpertNetwork
+    from dynmap_rl.reporting.media import film
+    from dynmap_rl.experts.network import list_checkpoints
+    from dynmap_rl.experts.network import roll_out
+    from dynmap_rl.training.ppo import POSITIVE
+    from dynmap_rl.evaluation.experts import fresh_scenes
+    from dynmap_rl.evaluation.experts import rates
+    from dynmap_rl.evaluation.experts import rates_text
+    from dynmap_rl.training.ppo import train_ppo
+    from dynmap_rl.runs.loggers import check_logger
 
     check_logger(config.logger)
     check_at_least_one(config, *POSITIVE)

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from dynmap_rl.commands import command_line, run_recipe
+from dynmap_rl.utils.cli import command_line
+from dynmap_rl.utils.cli import run_recipe
 
 TASKS = {
     "balance_reaching": "Task 1: Balance-Reaching",
@@ -42,7 +43,7 @@ class Config:
 
 
 def main(config: Config) -> None:
-    from dynmap_rl.evaluation import write_html
+    from dynmap_rl.reporting.html import write_html
 
     names = [name.strip() for name in config.only.split(",")] if config.only else list(FIGURES)
     if unknown := [name for name in names if name not in FIGURES]:
@@ -66,7 +67,7 @@ def main(config: Config) -> None:
 
 def name_datasets(config: Config) -> dict[str, str | Path]:
     """Task to dataset: those of the settings, or datasets/TASK."""
-    from dynmap_rl.data import load_meta
+    from dynmap_rl.data.demonstrations import load_meta
 
     if not config.datasets:
         return {task: Path("datasets") / task for task in TASKS}
@@ -79,7 +80,8 @@ def name_datasets(config: Config) -> dict[str, str | Path]:
 
 def load_episodes(config: Config, datasets: dict, task: str, split: str = "eval"):
     """Episodes ``[E, T]`` of a task's dataset, which is recorded where it is not there and none was asked for."""
-    from dynmap_rl.data import load_dataset, record_dataset
+    from dynmap_rl.data.demonstrations import load_dataset
+    from dynmap_rl.data.recording.shards import record_dataset
 
     if task not in datasets:
         raise ValueError(f"it needs a dataset of {task}; name one in --datasets")
@@ -110,8 +112,8 @@ def find_missing(config: Config, cells: list[str]) -> list[str]:
 
 
 def draw_distributions(config: Config, datasets: dict) -> None:
-    from dynmap_rl.evaluation.figures import plot_distributions
-    from dynmap_rl.runs import write_json
+    from dynmap_rl.reporting.figures import plot_distributions
+    from dynmap_rl.utils.files import write_json
 
     dynamics = {task: load_episodes(config, datasets, task, "train")["dynamics"] for task in datasets}
     ranges = plot_distributions(dynamics, config.output / "distributions.png")
@@ -122,8 +124,9 @@ def draw_distributions(config: Config, datasets: dict) -> None:
 
 def draw_fig2(config: Config, datasets: dict) -> None:
     """A demonstration over time."""
-    from dynmap_rl.data import load_meta
-    from dynmap_rl.evaluation.paper_figures import plot_trajectory, widest_ways
+    from dynmap_rl.data.demonstrations import load_meta
+    from dynmap_rl.paper.figures import plot_trajectory
+    from dynmap_rl.paper.figures import widest_ways
 
     episode = widest_ways(load_episodes(config, datasets, ONE), 1)[0]
     plot_trajectory(episode, load_meta(datasets[ONE])["normalization"], config.output / "fig2.png")
@@ -131,7 +134,8 @@ def draw_fig2(config: Config, datasets: dict) -> None:
 
 def draw_fig3(config: Config, datasets: dict) -> None:
     """A demonstration of each task."""
-    from dynmap_rl.evaluation.paper_figures import plot_film_strips, widest_ways
+    from dynmap_rl.paper.figures import plot_film_strips
+    from dynmap_rl.paper.figures import widest_ways
 
     strips = {TASKS.get(t, t): widest_ways(load_episodes(config, datasets, t), 1)[0] for t in datasets}
     plot_film_strips(strips, config.output / "fig3.png")
@@ -139,16 +143,16 @@ def draw_fig3(config: Config, datasets: dict) -> None:
 
 def draw_fig4(config: Config, datasets: dict) -> None:
     """Start states."""
-    from dynmap_rl.evaluation.paper_figures import plot_scenes
+    from dynmap_rl.paper.figures import plot_scenes
 
     plot_scenes(load_episodes(config, datasets, ONE)["pixels"][:, 0], config.output / "fig4.png")
 
 
 def draw_prediction(config: Config, datasets: dict, task: str, name: str) -> None:
     """What the world model of task 1 predicts on a task: Fig. 6 and 9."""
-    from dynmap_rl.evaluation.figures import plot_prediction
-    from dynmap_rl.evaluation.paper_figures import widest_ways
-    from dynmap_rl.modules import load_world_model
+    from dynmap_rl.reporting.figures import plot_prediction
+    from dynmap_rl.paper.figures import widest_ways
+    from dynmap_rl.modules.checkpoints import load_world_model
 
     find_missing(config, [WORLD_MODEL])
     world_model = load_world_model(config.runs / WORLD_MODEL / "world_model")
@@ -159,7 +163,8 @@ def draw_prediction(config: Config, datasets: dict, task: str, name: str) -> Non
 
 def draw_fig7(config: Config, datasets: dict) -> None:
     """Policy losses, held-out ones and those of training."""
-    from dynmap_rl.evaluation.paper_figures import loss_panels, plot_losses
+    from dynmap_rl.paper.figures import loss_panels
+    from dynmap_rl.paper.figures import plot_losses
 
     panels = loss_panels(ONE)
     cells = dict.fromkeys(cell for groups in panels.values() for group in groups.values() for cell in group)
@@ -171,9 +176,11 @@ def draw_fig7(config: Config, datasets: dict) -> None:
 
 def draw_fig8(config: Config, datasets: dict) -> None:
     """The paper's 50 test episodes of the first policy seed."""
-    from dynmap_rl.evaluation import SHARED_STARTS, roll_out, scene_seeds
-    from dynmap_rl.evaluation.paper_figures import plot_position_errors
-    from dynmap_rl.modules import load_actor
+    from dynmap_rl.evaluation.protocol import SHARED_STARTS
+    from dynmap_rl.evaluation.rollout import roll_out
+    from dynmap_rl.evaluation.rollout import scene_seeds
+    from dynmap_rl.paper.figures import plot_position_errors
+    from dynmap_rl.runs.lookup import load_actor
 
     missing, panels = find_missing(config, list(POLICIES.values())), dict.fromkeys(POLICIES)
     for title, cell in POLICIES.items():

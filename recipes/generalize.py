@@ -11,7 +11,8 @@ or says that it is done.
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynmap_rl.commands import replace_defaults, run_recipe
+from dynmap_rl.utils.cli import replace_defaults
+from dynmap_rl.utils.cli import run_recipe
 
 
 @dataclass
@@ -62,9 +63,12 @@ SMOKE = {
 def main(config: Config) -> None:
     import torch
 
-    from dynmap_rl import frozen, runs, settings
+    from dynmap_rl import frozen  # MODULE
+    from dynmap_rl import runs  # MODULE
+    from dynmap_rl import settings  # MODULE
     from dynmap_rl.envs.tasks import get_task
-    from dynmap_rl.evaluation import print_row, write_report
+    from dynmap_rl.reporting.run_page import print_row
+    from dynmap_rl.reporting.run_page import write_report
 
     if config.smoke:
         replace_defaults(config, SMOKE)

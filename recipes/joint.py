@@ -11,7 +11,8 @@ says that it is done.
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynmap_rl.commands import replace_defaults, run_recipe
+from dynmap_rl.utils.cli import replace_defaults
+from dynmap_rl.utils.cli import run_recipe
 
 
 @dataclass
@@ -51,7 +52,7 @@ class Config:
     beta_joint: float = 1.0
     # Weight of the steps in which the expert changes its action (see imitation_loss); 0 for the paper's plain L1.
     emphasis: float = 60.0
-    # Bars painted on the background of a window, at most (see dynmap_rl.data.add_distractors); 0 for none.
+    # Bars painted on the background of a window, at most (see dynmap_rl.data.augmentation.add_distractors); 0 for none.
     distractors: int = 3
     # Scenes to evaluate on: those of test, or of validation while you choose settings.
     split: str = "test"
@@ -75,9 +76,14 @@ SMOKE = {
 
 
 def main(config: Config) -> None:
-    from dynmap_rl import joint, modules, runs, settings
+    from dynmap_rl import joint  # MODULE
+    from dynmap_rl import modules  # MODULE
+    from dynmap_rl import runs  # MODULE
+    from dynmap_rl import settings  # MODULE
     from dynmap_rl.envs.tasks import NO_TASK
-    from dynmap_rl.evaluation import parse_supervision, print_row, write_report
+    from dynmap_rl.modules.supervision import parse_supervision
+    from dynmap_rl.reporting.run_page import print_row
+    from dynmap_rl.reporting.run_page import write_report
 
     if config.smoke:
         replace_defaults(config, SMOKE)

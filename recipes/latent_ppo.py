@@ -11,7 +11,10 @@ says that it is done.
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynmap_rl.commands import check_at_least_one, command_line, replace_defaults, run_recipe
+from dynmap_rl.utils.cli import check_at_least_one
+from dynmap_rl.utils.cli import command_line
+from dynmap_rl.utils.cli import replace_defaults
+from dynmap_rl.utils.cli import run_recipe
 
 
 @dataclass
@@ -70,13 +73,19 @@ SMOKE = {
 def main(config: Config) -> None:
     import torch
 
-    from dynmap_rl import experts, frozen, runs
+    from dynmap_rl import experts  # MODULE
+    from dynmap_rl import frozen  # MODULE
+    from dynmap_rl import runs  # MODULE
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.envs.world import ACCELERATION_LIMIT
-    from dynmap_rl.evaluation import failures_first, write_html
-    from dynmap_rl.experts.ppo import POSITIVE, fresh_scenes, rates, train_ppo
-    from dynmap_rl.loggers import check_logger
-    from dynmap_rl.weights import fingerprint
+    from dynmap_rl.evaluation.rollout import failures_first
+    from dynmap_rl.reporting.html import write_html
+    from dynmap_rl.training.ppo import POSITIVE
+    from dynmap_rl.evaluation.experts import fresh_scenes
+    from dynmap_rl.evaluation.experts import rates
+    from dynmap_rl.training.ppo import train_ppo
+    from dynmap_rl.runs.loggers import check_logger
+    from dynmap_rl.utils.weights import fingerprint
 
     if config.smoke:
         replace_defaults(config, SMOKE)
@@ -134,7 +143,8 @@ def make_env(world_model, task: str, num_envs: int, keep_pixels: bool = False):
     """``state`` is what the world model makes of the frames, and the goal; frames themselves are kept if asked for."""
     from torchrl.envs import CatTensors, Compose, ExcludeTransform, TransformedEnv
 
-    from dynmap_rl.envs import DynmapBatchedEnv, WorldModelTransform
+    from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
+    from dynmap_rl.envs.world_model_transform import WorldModelTransform
 
     env = DynmapBatchedEnv(task, num_envs, from_pixels=True, control="acceleration", pixels_only=True)
     states = CatTensors(["latent", "hidden1", "hidden2", "goal"], "state", del_keys=False, sort=False)
@@ -168,14 +178,14 @@ def film(network, world_model, task: str, seeds: list[int], path: Path) -> None:
     """:func:`play` as an animation."""
     import torch
 
-    from dynmap_rl.evaluation.figures import save_gif
+    from dynmap_rl.reporting.media import save_gif
 
     env = make_env(world_model, task, len(seeds), keep_pixels=True)
     save_gif(torch.stack([td["pixels"] for td in play(env, network, seeds)], 1), path)
 
 
 def result_text(result: dict) -> str:
-    from dynmap_rl.experts.ppo import rates_text
+    from dynmap_rl.evaluation.experts import rates_text
 
     return "\n".join(f"PPO on {name:8} {rates_text(result[name])}" for name in ("latents", "states"))
 

@@ -18,7 +18,7 @@ import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynmap_rl.commands import run_recipe
+from dynmap_rl.utils.cli import run_recipe
 
 
 @dataclass
@@ -52,13 +52,20 @@ class Config:
 
 
 def main(config: Config) -> None:
-    from dynmap_rl.data import push_dataset
-    from dynmap_rl.data.human import list_shards, next_scene, open_folder, publish_episodes
+    from dynmap_rl.data.format.hub import push_dataset
+    from dynmap_rl.data.recording.human import list_shards
+    from dynmap_rl.data.recording.human import next_scene
+    from dynmap_rl.data.recording.human import open_folder
+    from dynmap_rl.data.recording.human import publish_episodes
     from dynmap_rl.envs.tasks import get_task
-    from dynmap_rl.envs.world import CONTROL_DT, EPISODE_STEPS
-    from dynmap_rl.evaluation import write_dataset_page
-    from dynmap_rl.modules import find_run, load_actor, task_of_run
-    from dynmap_rl.play import PlayWindow, Session
+    from dynmap_rl.envs.world import CONTROL_DT
+    from dynmap_rl.envs.world import EPISODE_STEPS
+    from dynmap_rl.reporting.dataset_page import write_dataset_page
+    from dynmap_rl.runs.lookup import find_run
+    from dynmap_rl.runs.lookup import load_actor
+    from dynmap_rl.runs.lookup import task_of_run
+    from dynmap_rl.play.window import PlayWindow
+    from dynmap_rl.play.session import Session
 
     run = find_run(config.policy) if config.policy else None
     task = config.task or (run and task_of_run(run)) or "balance_reaching"
@@ -107,7 +114,7 @@ def main(config: Config) -> None:
 
 def play(config: Config, task: str, session, window, frames: list, dt: float) -> None:
     """Until the window is closed, or for a number of steps."""
-    from dynmap_rl.data import keep_episode
+    from dynmap_rl.data.recording.human import keep_episode
     from dynmap_rl.envs.renderer import pygame
 
     clock, step, waited = pygame.time.Clock(), 0, 0

@@ -13,7 +13,8 @@ import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynmap_rl.commands import command_line, run_recipe
+from dynmap_rl.utils.cli import command_line
+from dynmap_rl.utils.cli import run_recipe
 
 
 @dataclass
@@ -35,11 +36,16 @@ class Config:
 
 
 def main(config: Config) -> None:
-    from dynmap_rl.data import load_dataset, record_dataset
-    from dynmap_rl.evaluation import open_loop_errors, row_name, write_html
-    from dynmap_rl.evaluation.probing import plot_open_loop, plot_probes, probe
-    from dynmap_rl.frozen import load_source
-    from dynmap_rl.runs import write_json
+    from dynmap_rl.data.demonstrations import load_dataset
+    from dynmap_rl.data.recording.shards import record_dataset
+    from dynmap_rl.evaluation.open_loop import open_loop_errors
+    from dynmap_rl.modules.supervision import row_name
+    from dynmap_rl.reporting.html import write_html
+    from dynmap_rl.reporting.figures import plot_open_loop
+    from dynmap_rl.reporting.figures import plot_probes
+    from dynmap_rl.evaluation.probing import probe
+    from dynmap_rl.runs.lookup import load_source
+    from dynmap_rl.utils.files import write_json
 
     if min(config.train_episodes, config.test_episodes) < 1:
         raise ValueError("--train_episodes and --test_episodes must be at least 1")

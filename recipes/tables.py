@@ -19,14 +19,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 
-from dynmap_rl.cells import TABLES, Cell, list_cells
-from dynmap_rl.commands import (
-    check_at_least_one,
-    refuse,
-    replace_defaults,
-    run_recipe,
-    run_script,
-)
+from dynmap_rl.paper.cells import TABLES
+from dynmap_rl.paper.cells import Cell
+from dynmap_rl.paper.cells import list_cells
+from dynmap_rl.utils.cli import check_at_least_one
+from dynmap_rl.utils.cli import refuse
+from dynmap_rl.utils.cli import replace_defaults
+from dynmap_rl.utils.cli import run_recipe
+from dynmap_rl.utils.processes import run_script
 
 RECIPES = Path(__file__).parent
 SMOKE = Path("runs/tables_smoke")
@@ -61,7 +61,8 @@ class Config:
 def run_cell(cell: Cell, config: Config, root: Path) -> str | None:
     """Run the recipe in ``root``, where it goes on where it was stopped, and keep its ``eval.json``; a message if it
     failed."""
-    from dynmap_rl.runs import read_json, write_json
+    from dynmap_rl.utils.files import read_json
+    from dynmap_rl.utils.files import write_json
 
     folder, log = config.runs / cell.name, root / config.runs / f"{cell.name}.log"
     arguments = [*cell.arguments, "--run", str(folder)]
@@ -163,7 +164,7 @@ def check_config(config: Config) -> None:
 
 def main(config: Config) -> None:
     if config.print:
-        from dynmap_rl.evaluation.tables import print_tables
+        from dynmap_rl.paper.tables import print_tables
 
         return print_tables(config.results, config.print)
     check_config(config)
@@ -177,8 +178,8 @@ def main(config: Config) -> None:
         return print(
             f"{len(cells) - len(todo)} of {len(cells)} cells are done; about {hours:.1f} hours of one core are left"
         )
-    from dynmap_rl.evaluation.tables import write_tables_page
-    from dynmap_rl.settings import find_or_record
+    from dynmap_rl.paper.tables import write_tables_page
+    from dynmap_rl.training.dataset import find_or_record
 
     if not todo:
         print(

@@ -16,7 +16,7 @@ from unittest import mock
 import pytest
 import torch
 
-from dynmap_rl.commands import run_recipe
+from dynmap_rl.utils.cli import run_recipe
 
 BROWSER = Path(__file__).with_name("browser.py")
 

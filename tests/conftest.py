@@ -61,7 +61,8 @@ def command(installed):
 @pytest.fixture(scope="session")
 def recordings(tmp_path_factory):
     """The folder of a small dataset of a task, 4 + 2 demonstrations in three shards; not to be written to."""
-    from dynmap_rl.data import record_dataset, recording
+    from dynmap_rl.data.recording.shards import record_dataset
+    from dynmap_rl.data import recording  # MODULE
 
     root = tmp_path_factory.mktemp("datasets")
 

@@ -18,7 +18,7 @@ FEATURES = {
 def make_foreign(root, lengths=(31, 47, 24, 33), videos=False, turns=3.0):
     """States x, y (0..1 of the frame), an angle within -pi..pi that turns with up to ``turns`` rad/s, and a gripper
     that stays shut; actions are velocities. The squares end their ways in the middle of the table."""
-    from dynmap_rl.data.writing import quiet
+    from dynmap_rl.data.format.writing import quiet
 
     with quiet():
         from lerobot.datasets import LeRobotDataset

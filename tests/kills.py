@@ -26,7 +26,8 @@ from pathlib import Path
 import torch
 from safetensors.torch import load_file
 
-from dynmap_rl.runs import read_json, write_json
+from dynmap_rl.utils.files import read_json
+from dynmap_rl.utils.files import write_json
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 SMALL = "--num_envs 4 --iterations 12 --epochs 1 --minibatch 240 --checkpoint_every 2 --eval_episodes 4 --final_episodes 4"

@@ -11,9 +11,10 @@ import commands
 import pytest
 import torch
 
-from dynmap_rl import data
-from dynmap_rl.modules import DYNAMICS, make_world_model
-from dynmap_rl.objectives import WorldModelLoss
+from dynmap_rl import data  # MODULE
+from dynmap_rl.modules.decoder import DYNAMICS
+from dynmap_rl.modules.checkpoints import make_world_model
+from dynmap_rl.objectives.world_model import WorldModelLoss
 
 SMALL = {
     "control_step": {},

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import pytest
 import torch
 
-from dynmap_rl import commands
+from dynmap_rl import commands  # MODULE
 
 
 @dataclass

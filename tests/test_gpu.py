@@ -5,11 +5,25 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from dynmap_rl.data import add_distractors, augment, compute_features, load_dataset, load_meta, sample_windows
-from dynmap_rl.evaluation import roll_out, scene_seeds
-from dynmap_rl.modules import Actor, make_policy, make_world_model, mixed_precision
-from dynmap_rl.objectives import ImitationLoss, JointLoss, WorldModelLoss
-from dynmap_rl.training import make_optimizer, step, train_policy, train_world_model
+from dynmap_rl.data.augmentation import add_distractors
+from dynmap_rl.data.augmentation import augment
+from dynmap_rl.data.features import compute_features
+from dynmap_rl.data.demonstrations import load_dataset
+from dynmap_rl.data.demonstrations import load_meta
+from dynmap_rl.data.windows import sample_windows
+from dynmap_rl.evaluation.rollout import roll_out
+from dynmap_rl.evaluation.rollout import scene_seeds
+from dynmap_rl.modules.actor import Actor
+from dynmap_rl.modules.checkpoints import make_policy
+from dynmap_rl.modules.checkpoints import make_world_model
+from dynmap_rl.modules.precision import mixed_precision
+from dynmap_rl.objectives.imitation import ImitationLoss
+from dynmap_rl.objectives.joint import JointLoss
+from dynmap_rl.objectives.world_model import WorldModelLoss
+from dynmap_rl.training.loop import make_optimizer
+from dynmap_rl.training.loop import step
+from dynmap_rl.training.policy import train_policy
+from dynmap_rl.training.world_model import train_world_model
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 SETTINGS = SimpleNamespace(

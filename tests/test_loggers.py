@@ -11,9 +11,10 @@ import pytest
 import torch
 from commands import run
 
-from dynmap_rl import loggers
-from dynmap_rl.loggers import check_logger, log_metrics
-from dynmap_rl.runs import read_metrics
+from dynmap_rl import loggers  # MODULE
+from dynmap_rl.runs.loggers import check_logger
+from dynmap_rl.runs.loggers import log_metrics
+from dynmap_rl.runs.folder import read_metrics
 
 
 @pytest.fixture(autouse=True)

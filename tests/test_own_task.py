@@ -12,10 +12,13 @@ import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
 
-from dynmap_rl.data import load_dataset, load_meta
-from dynmap_rl.envs import DynmapBatchedEnv, DynmapEnv
+from dynmap_rl.data.demonstrations import load_dataset
+from dynmap_rl.data.demonstrations import load_meta
+from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
+from dynmap_rl.envs.gym_env import DynmapEnv
 from dynmap_rl.envs.renderer import Renderer
-from dynmap_rl.envs.tasks import TASKS, get_task
+from dynmap_rl.envs.tasks import TASKS
+from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.world import EPISODE_STEPS
 
 RECIPES = Path(__file__).parents[1] / "recipes"

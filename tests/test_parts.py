@@ -4,7 +4,9 @@ import pytest
 import torch
 from torch import nn
 
-from dynmap_rl.parts import differentiate, map_in_threads, split_batch
+from dynmap_rl.training.parallel import differentiate
+from dynmap_rl.training.parallel import map_in_threads
+from dynmap_rl.training.parallel import split_batch
 
 CPU = torch.device("cpu")
 

@@ -7,10 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from dynmap_rl.evaluation import wilson
-from dynmap_rl.evaluation.findings import markdown_findings, markdown_spread, spread
-from dynmap_rl.evaluation.paper import TABLES
-from dynmap_rl.evaluation.tables import COLUMNS, markdown_overview, markdown_table, read_cells
+from dynmap_rl.evaluation.statistics import wilson
+from dynmap_rl.paper.findings import markdown_findings
+from dynmap_rl.paper.findings import markdown_spread
+from dynmap_rl.paper.findings import spread
+from dynmap_rl.paper.published import TABLES
+from dynmap_rl.paper.tables import COLUMNS
+from dynmap_rl.paper.tables import markdown_overview
+from dynmap_rl.paper.tables import markdown_table
+from dynmap_rl.paper.tables import read_cells
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()

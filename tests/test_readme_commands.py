@@ -13,9 +13,9 @@ from pathlib import Path
 import draccus
 import pytest
 
-from dynmap_rl.cells import list_cells
-from dynmap_rl.commands import read_arguments
-from dynmap_rl.modules import find_run
+from dynmap_rl.paper.cells import list_cells
+from dynmap_rl.utils.cli import read_arguments
+from dynmap_rl.runs.lookup import find_run
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()

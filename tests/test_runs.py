@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from dynmap_rl import runs
+from dynmap_rl import runs  # MODULE
 
 
 @dataclass

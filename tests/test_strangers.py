@@ -8,12 +8,14 @@ import pytest
 import torch
 from commands import run
 
-from dynmap_rl.data import add_dynamics
-from dynmap_rl.experts.policy import CHECKPOINTS
-from dynmap_rl.frozen import load_source
-from dynmap_rl.modules import find_run, load_actor, task_of_run
-from dynmap_rl.modules.checkpoints import SHIPPED
-from dynmap_rl.settings import name_task
+from dynmap_rl.data.derive import add_dynamics
+from dynmap_rl.experts.network import CHECKPOINTS
+from dynmap_rl.runs.lookup import load_source
+from dynmap_rl.runs.lookup import find_run
+from dynmap_rl.runs.lookup import load_actor
+from dynmap_rl.runs.lookup import task_of_run
+from dynmap_rl.runs.lookup import SHIPPED
+from dynmap_rl.training.dataset import name_task
 
 
 @pytest.fixture

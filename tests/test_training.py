@@ -6,11 +6,20 @@ import torch
 from safetensors.torch import load_file, save_file
 from tensordict import TensorDict
 
-from dynmap_rl import frozen, runs, training
-from dynmap_rl.data import compute_features, sample_windows
-from dynmap_rl.modules import DYNAMICS, make_policy, make_world_model, mixed_precision
-from dynmap_rl.training import check_loss, descend, train_policy, train_world_model
-from dynmap_rl.weights import fingerprint
+from dynmap_rl import frozen  # MODULE
+from dynmap_rl import runs  # MODULE
+from dynmap_rl import training  # MODULE
+from dynmap_rl.data.features import compute_features
+from dynmap_rl.data.windows import sample_windows
+from dynmap_rl.modules.decoder import DYNAMICS
+from dynmap_rl.modules.checkpoints import make_policy
+from dynmap_rl.modules.checkpoints import make_world_model
+from dynmap_rl.modules.precision import mixed_precision
+from dynmap_rl.training.loop import check_loss
+from dynmap_rl.training.loop import descend
+from dynmap_rl.training.policy import train_policy
+from dynmap_rl.training.world_model import train_world_model
+from dynmap_rl.utils.weights import fingerprint
 
 CONSTANTS = {
     "action": {"low": [-0.02, -0.02, -0.05], "high": [0.02, 0.02, 0.05]},

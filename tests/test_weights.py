@@ -9,9 +9,13 @@ import torch
 from safetensors.torch import save_file
 from torch import nn
 
-from dynmap_rl.modules import WorldModel, checkpoints, load_policy, load_world_model
-from dynmap_rl.modules.checkpoints import SHIPPED
-from dynmap_rl.weights import load_module, save_weights
+from dynmap_rl.modules.world_model import WorldModel
+from dynmap_rl.modules import checkpoints  # MODULE
+from dynmap_rl.modules.checkpoints import load_policy
+from dynmap_rl.modules.checkpoints import load_world_model
+from dynmap_rl.runs.lookup import SHIPPED
+from dynmap_rl.utils.weights import load_module
+from dynmap_rl.utils.weights import save_weights
 
 RUN = SHIPPED / "balance_reaching"
 
@@ -120,7 +124,7 @@ def test_a_pickle_in_the_place_of_weights_is_not_run(tmp_path):
         "torch.save({'model': Bad(), 'rng': torch.get_rng_state()}, folder / 'state.pt')"
     )
     subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True)
-    from dynmap_rl.runs import load_training_state
+    from dynmap_rl.runs.folder import load_training_state
 
     for load in (load_training_state, lambda path: load_module(path, lambda: nn.Linear(3, 2))):
         with pytest.raises(ValueError, match="state.pt"):

@@ -6,9 +6,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tqdm import tqdm
 
-from dynmap_rl.modules import WorldModel
-
 from .augmentation import augment
+from dynmap_rl.modules.world_model import WorldModel
 
 
 @torch.no_grad()

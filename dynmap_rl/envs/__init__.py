@@ -8,9 +8,9 @@ from .world import World
 _MODULES = {
     "BalanceReaching": "tasks",
     "DynmapBatchedEnv": "torchrl_env",
-    "DynmapEnv": "gymnasium_env",
+    "DynmapEnv": "gym_env",
     "ImaginationEnv": "imagination",
-    "WorldModelTransform": "transforms",
+    "WorldModelTransform": "world_model_transform",
     "get_task": "tasks",
     "make_start": "imagination",
 }

@@ -9,9 +9,9 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import ModelBasedEnvBase
 
-from dynmap_rl.modules import MEMORY, WorldModel
-
-from .transforms import WorldModelTransform
+from .world_model_transform import WorldModelTransform
+from dynmap_rl.modules.actor import MEMORY
+from dynmap_rl.modules.world_model import WorldModel
 
 STEP_KEYS = ("latent", "predicted_latent", *MEMORY)
 

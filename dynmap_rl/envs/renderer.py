@@ -8,14 +8,16 @@ import warnings
 
 import numpy as np
 
+from .geometry import Polygon
+from .tasks import BalanceReaching
+from .world import World
+
 os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # pygame imports the deprecated pkg_resources
     import pygame
 
-from .geometry import Polygon
-from .tasks import BalanceReaching
-from .world import World
 
 RGB = (
     0xFF,

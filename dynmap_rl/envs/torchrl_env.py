@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from .gymnasium_env import ACTION_LIMITS
+from .gym_env import ACTION_LIMITS
 from .renderer import Renderer
 from .scene import SceneRanges, choose_ranges
 from .tasks import get_task

@@ -10,7 +10,8 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import step_mdp
 from tqdm import tqdm
 
-from dynmap_rl.envs import DynmapBatchedEnv, scene_seed
+from dynmap_rl.envs.scene import scene_seed
+from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.envs.world import EPISODE_STEPS
 
 

@@ -1,25 +1,5 @@
-"""State-based PPO experts."""
+"""State-based experts and the checkpoints that ship with the package."""
 
-from .policy import (
-    ExpertNetwork,
-    film,
-    find_expert,
-    list_checkpoints,
-    load_expert,
-    make_actor,
-    play,
-    roll_out,
-    task_of_expert,
-)
+from .network import ExpertNetwork, list_checkpoints, load_expert, make_actor, roll_out
 
-__all__ = [
-    "ExpertNetwork",
-    "film",
-    "find_expert",
-    "list_checkpoints",
-    "load_expert",
-    "make_actor",
-    "play",
-    "roll_out",
-    "task_of_expert",
-]
+__all__ = ["ExpertNetwork", "list_checkpoints", "load_expert", "make_actor", "roll_out"]

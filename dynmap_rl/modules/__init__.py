@@ -1,16 +1,13 @@
-"""World model and policies: plain ``nn.Module`` building blocks."""
+"""World model and policies: plain ``nn.Module`` building blocks and their TensorDict adapters."""
 
+from .actor import MEMORY, Actor, LatentActor, make_policy_module, make_world_model_module
 from .checkpoints import (
-    check_policy,
-    find_run,
-    load_actor,
     load_policy,
     load_world_model,
     make_policy,
     make_world_model,
     save_policy,
     save_world_model,
-    task_of_run,
 )
 from .decoder import DYNAMICS, DynamicsDecoder, ImageDecoder
 from .encoder import Encoder, SpatialSoftmax
@@ -18,7 +15,6 @@ from .normalization import Normalizer
 from .policy import FeedforwardPolicy, RecurrentPolicy
 from .precision import mixed_precision
 from .recurrent import TwoLSTM, delay
-from .tensordict_modules import MEMORY, Actor, LatentActor, make_policy_module, make_world_model_module
 from .transition import Transition
 from .world_model import WorldModel
 
@@ -37,10 +33,7 @@ __all__ = [
     "Transition",
     "TwoLSTM",
     "WorldModel",
-    "check_policy",
     "delay",
-    "find_run",
-    "load_actor",
     "load_policy",
     "load_world_model",
     "make_policy",
@@ -50,5 +43,4 @@ __all__ = [
     "mixed_precision",
     "save_policy",
     "save_world_model",
-    "task_of_run",
 ]

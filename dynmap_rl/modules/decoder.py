@@ -8,10 +8,11 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
+from dynmap_rl.keys import DYNAMICS
+
 from .layers import BLOCK, up
 from .normalization import Normalizer
 
-DYNAMICS = ("position", "velocity", "acceleration")
 
 
 class ImageDecoder(nn.Module):

@@ -11,7 +11,8 @@ from tensordict.utils import NestedKey, unravel_key
 from torch.nn import functional as F
 from torchrl.objectives.common import LossModule
 
-from dynmap_rl.modules import FeedforwardPolicy, Normalizer, RecurrentPolicy
+from dynmap_rl.modules.normalization import Normalizer
+from dynmap_rl.modules.policy import FeedforwardPolicy, RecurrentPolicy
 
 
 def imitation_loss(

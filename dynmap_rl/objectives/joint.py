@@ -9,8 +9,7 @@ from tensordict.nn import dispatch
 from tensordict.utils import NestedKey, unravel_key
 from torchrl.objectives.common import LossModule
 
-from dynmap_rl.modules import FeedforwardPolicy, RecurrentPolicy
-
+from dynmap_rl.modules.policy import FeedforwardPolicy, RecurrentPolicy
 from .imitation import find_ignored, imitation_loss
 from .world_model import WorldModelLoss
 

@@ -10,8 +10,8 @@ from tensordict.nn import dispatch
 from tensordict.utils import NestedKey, unravel_key
 from torchrl.objectives.common import LossModule
 
-from dynmap_rl.modules import WorldModel
 from dynmap_rl.modules.layers import to_blocks
+from dynmap_rl.modules.world_model import WorldModel
 
 
 class WorldModelLoss(LossModule):

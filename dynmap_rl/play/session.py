@@ -9,12 +9,14 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from dynmap_rl.data.demonstrations import KEYS
-from dynmap_rl.envs import DynmapBatchedEnv, scene_seed
+from dynmap_rl.data.recording.plans import KEYS
+from dynmap_rl.envs.scene import scene_seed
 from dynmap_rl.envs.tasks import BalanceReaching
+from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.envs.world import ACTION_LIMIT, CONTROL_DT, EPISODE_STEPS
-from dynmap_rl.experts import load_expert, task_of_expert
-from dynmap_rl.modules import DYNAMICS, Actor
+from dynmap_rl.experts.network import load_expert, task_of_expert
+from dynmap_rl.modules.actor import Actor
+from dynmap_rl.keys import DYNAMICS
 
 DRIVERS = "hand", "expert", "policy"
 HAND_ACCELERATION = np.array([1.5, 1.5, 4.0])  # m/s^2, m/s^2, rad/s^2: at the cart's limit a tall block tips

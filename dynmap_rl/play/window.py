@@ -8,8 +8,7 @@ import numpy as np
 
 from dynmap_rl.envs.renderer import Renderer, pygame
 from dynmap_rl.envs.world import ACCELERATION_LIMIT, EPISODE_STEPS, VELOCITY_LIMIT
-from dynmap_rl.modules import DYNAMICS
-
+from dynmap_rl.keys import DYNAMICS
 from .session import Session
 
 BLACK, GRAY, LIGHT, WHITE, GREEN = (0, 0, 0), (120, 120, 120), (225, 225, 225), (255, 255, 255), (44, 160, 44)

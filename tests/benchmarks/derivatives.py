@@ -15,9 +15,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dynmap_rl.data import add_dynamics, differentiate, load_dataset
+from dynmap_rl.data.derive import add_dynamics
+from dynmap_rl.data.derive import differentiate
+from dynmap_rl.data.demonstrations import load_dataset
 from dynmap_rl.envs.world import CONTROL_DT
-from dynmap_rl.runs import write_json
+from dynmap_rl.utils.files import write_json
 
 RESULTS = Path(__file__).parents[2] / "recipes" / "results" / "derivatives.json"
 DATASET = "datasets/balance_reaching"

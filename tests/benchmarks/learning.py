@@ -8,13 +8,22 @@ from timing import compare, seconds
 from torch import nn
 
 import dynmap_rl  # noqa: F401  (registers the ids)
-from dynmap_rl import data
+from dynmap_rl import data  # MODULE
 from dynmap_rl.envs.world import EPISODE_STEPS
-from dynmap_rl.evaluation import roll_out, scene_seeds
-from dynmap_rl.modules import Actor, WorldModel, make_policy, make_world_model, mixed_precision
-from dynmap_rl.objectives.world_model import WorldModelLoss, rms
-from dynmap_rl.parts import differentiate, map_in_threads, split_batch
-from dynmap_rl.training import descend, make_optimizer
+from dynmap_rl.evaluation.rollout import roll_out
+from dynmap_rl.evaluation.rollout import scene_seeds
+from dynmap_rl.modules.actor import Actor
+from dynmap_rl.modules.world_model import WorldModel
+from dynmap_rl.modules.checkpoints import make_policy
+from dynmap_rl.modules.checkpoints import make_world_model
+from dynmap_rl.modules.precision import mixed_precision
+from dynmap_rl.objectives.world_model import WorldModelLoss
+from dynmap_rl.objectives.world_model import rms
+from dynmap_rl.training.parallel import differentiate
+from dynmap_rl.training.parallel import map_in_threads
+from dynmap_rl.training.parallel import split_batch
+from dynmap_rl.training.loop import descend
+from dynmap_rl.training.loop import make_optimizer
 
 SUPERVISION = ("position", "velocity")
 

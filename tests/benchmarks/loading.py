@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from timing import compare, seconds
 
-from dynmap_rl import data
+from dynmap_rl import data  # MODULE
 
 WINDOWS, STEPS = 16, 24
 

@@ -18,7 +18,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from dynmap_rl.runs import read_json, write_json
+from dynmap_rl.utils.files import read_json
+from dynmap_rl.utils.files import write_json
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 RESULTS = RECIPES / "results" / "memory.json"

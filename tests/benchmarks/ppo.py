@@ -15,9 +15,10 @@ import numpy as np
 import torch
 
 import dynmap_rl  # noqa: F401  (registers the ids)
-from dynmap_rl.envs import scene_seed
+from dynmap_rl.envs.scene import scene_seed
 from dynmap_rl.envs.tasks import get_task
-from dynmap_rl.envs.world import ACCELERATION_LIMIT, EPISODE_STEPS
+from dynmap_rl.envs.world import ACCELERATION_LIMIT
+from dynmap_rl.envs.world import EPISODE_STEPS
 
 GOAL = 0.97
 EXPERT = Path(__file__).parents[2] / "recipes" / "expert.py"

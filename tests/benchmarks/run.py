@@ -23,7 +23,8 @@ import ppo
 import simulation
 import starting
 
-from dynmap_rl.runs import read_json, write_json
+from dynmap_rl.utils.files import read_json
+from dynmap_rl.utils.files import write_json
 
 RESULTS = Path(__file__).parents[2] / "recipes" / "results" / "benchmarks.json"
 MAIN_JOBS = RESULTS.with_name("main_job_time.json")

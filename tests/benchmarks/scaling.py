@@ -14,11 +14,14 @@ import matplotlib
 import torch
 from timing import seconds
 
-from dynmap_rl import data
-from dynmap_rl.envs import DynmapBatchedEnv
-from dynmap_rl.evaluation import roll_out, scene_seeds
-from dynmap_rl.modules import Actor, make_policy, make_world_model
-from dynmap_rl.runs import write_json
+from dynmap_rl import data  # MODULE
+from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
+from dynmap_rl.evaluation.rollout import roll_out
+from dynmap_rl.evaluation.rollout import scene_seeds
+from dynmap_rl.modules.actor import Actor
+from dynmap_rl.modules.checkpoints import make_policy
+from dynmap_rl.modules.checkpoints import make_world_model
+from dynmap_rl.utils.files import write_json
 
 RESULTS = Path(__file__).parents[2] / "recipes" / "results"
 FACTORS = 1, 10, 100

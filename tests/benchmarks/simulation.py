@@ -14,10 +14,14 @@ from timing import compare, seconds
 from torchrl.envs.utils import step_mdp
 
 import dynmap_rl  # noqa: F401  (registers the ids)
-from dynmap_rl.envs import DynmapBatchedEnv, World, sample_scene
+from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
+from dynmap_rl.envs.world import World
+from dynmap_rl.envs.scene import sample_scene
 from dynmap_rl.envs.renderer import Renderer
 from dynmap_rl.envs.tasks import get_task
-from dynmap_rl.envs.world import CONTROL_DT, EPISODE_STEPS, SUBSTEPS
+from dynmap_rl.envs.world import CONTROL_DT
+from dynmap_rl.envs.world import EPISODE_STEPS
+from dynmap_rl.envs.world import SUBSTEPS
 
 TASK = get_task("balance_reaching")
 

@@ -16,7 +16,7 @@ import subprocess
 from pathlib import Path
 
 from dynmap_rl.envs.tasks import TASKS
-from dynmap_rl.runs import write_json
+from dynmap_rl.utils.files import write_json
 
 RESULTS = Path(__file__).parents[2] / "recipes" / "results"
 COMMANDS = {

@@ -5,8 +5,10 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from dynmap_rl.data import add_distractors, augment, sample_windows
-from dynmap_rl.envs import DynmapBatchedEnv
+from dynmap_rl.data.augmentation import add_distractors
+from dynmap_rl.data.augmentation import augment
+from dynmap_rl.data.windows import sample_windows
+from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 
 
 def make_episodes(num_envs=8, steps=6):

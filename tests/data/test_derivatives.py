@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from foreign_dataset import draw
 
-from dynmap_rl.data import differentiate
+from dynmap_rl.data.derive import differentiate
 from dynmap_rl.data.tracking import track_centroid
 
 EVEN = np.arange(20) / 25

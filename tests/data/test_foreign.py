@@ -8,7 +8,10 @@ import pytest
 import torch
 from foreign_dataset import CAMERA, make_foreign
 
-from dynmap_rl.data import add_dynamics, load_foreign, range_constants, sample_windows
+from dynmap_rl.data.derive import add_dynamics
+from dynmap_rl.data.robot import load_foreign
+from dynmap_rl.data.robot import range_constants
+from dynmap_rl.data.windows import sample_windows
 
 LENGTHS = (31, 47, 24, 33)
 

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from dynmap_rl.data import load_dataset
-from dynmap_rl.data.hub import draw_episodes
+from dynmap_rl.data.demonstrations import load_dataset
+from dynmap_rl.data.format.hub import draw_episodes
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "collect.py"
 ONLINE = f"""

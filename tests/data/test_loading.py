@@ -9,14 +9,17 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
-from dynmap_rl.data import load_dataset, load_meta
-from dynmap_rl.data.loading import CAMERA, NEEDED, OPTIONAL
+from dynmap_rl.data.demonstrations import load_dataset
+from dynmap_rl.data.demonstrations import load_meta
+from dynmap_rl.data.demonstrations import CAMERA
+from dynmap_rl.data.demonstrations import NEEDED
+from dynmap_rl.data.demonstrations import OPTIONAL
 
 
 def test_equals_what_lerobot_reads(recording):
     from lerobot.datasets import LeRobotDataset
 
-    from dynmap_rl.data.writing import quiet
+    from dynmap_rl.data.format.writing import quiet
 
     with quiet():
         dataset = LeRobotDataset("local/recording", root=recording, video_backend="pyav")

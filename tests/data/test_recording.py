@@ -15,13 +15,17 @@ import torch
 from filelock import FileLock
 from tensordict import TensorDict
 
-from dynmap_rl.data import load_dataset, load_meta, normalization_constants, record_dataset
-from dynmap_rl.data import recording as module
-from dynmap_rl.data.writing import FEATURES
-from dynmap_rl.envs.tasks import TASKS, get_task
+from dynmap_rl.data.demonstrations import load_dataset
+from dynmap_rl.data.demonstrations import load_meta
+from dynmap_rl.data.recording.shards import normalization_constants
+from dynmap_rl.data.recording.shards import record_dataset
+from dynmap_rl.data import recording as module  # MODULE
+from dynmap_rl.data.format.writing import FEATURES
+from dynmap_rl.envs.tasks import TASKS
+from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.world import VELOCITY_LIMIT
-from dynmap_rl.experts import list_checkpoints
-from dynmap_rl.runs import write_json
+from dynmap_rl.experts.network import list_checkpoints
+from dynmap_rl.utils.files import write_json
 
 DYNAMICS = ("position", "velocity", "acceleration")
 

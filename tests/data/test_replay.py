@@ -4,10 +4,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from dynmap_rl.data import as_replay_buffer, load_dataset
-from dynmap_rl.envs import WorldModelTransform
-from dynmap_rl.modules import make_world_model
-from dynmap_rl.objectives import WorldModelLoss
+from dynmap_rl.data.replay import as_replay_buffer
+from dynmap_rl.data.demonstrations import load_dataset
+from dynmap_rl.envs.world_model_transform import WorldModelTransform
+from dynmap_rl.modules.checkpoints import make_world_model
+from dynmap_rl.objectives.world_model import WorldModelLoss
 
 CONSTANTS = {
     "action": {"low": [-0.02, -0.02, -0.05], "high": [0.02, 0.02, 0.05]},

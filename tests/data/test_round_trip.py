@@ -6,12 +6,17 @@ import numpy as np
 import pytest
 import torch
 
-from dynmap_rl.data import load_dataset, load_meta, record_dataset
-from dynmap_rl.data.demonstrations import Plan, plan_demonstrations, roll_out
-from dynmap_rl.envs.tasks import TASKS, get_task
+from dynmap_rl.data.demonstrations import load_dataset
+from dynmap_rl.data.demonstrations import load_meta
+from dynmap_rl.data.recording.shards import record_dataset
+from dynmap_rl.data.recording.plans import Plan
+from dynmap_rl.data.recording.plans import plan_demonstrations
+from dynmap_rl.data.recording.plans import roll_out
+from dynmap_rl.envs.tasks import TASKS
+from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.world import CONTROL_DT
-from dynmap_rl.experts import list_checkpoints
-from dynmap_rl.experts.policy import find_expert
+from dynmap_rl.experts.network import list_checkpoints
+from dynmap_rl.experts.network import find_expert
 
 DYNAMICS = ("position", "velocity", "acceleration")
 

@@ -9,10 +9,17 @@ import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
-from dynmap_rl.envs.geometry import hits, is_clear, length, path_is_blocked, way_around
-from dynmap_rl.envs.scene import ObstacleRanges, ObstacleScene
+from dynmap_rl.envs.geometry import hits
+from dynmap_rl.envs.geometry import is_clear
+from dynmap_rl.envs.geometry import length
+from dynmap_rl.envs.geometry import path_is_blocked
+from dynmap_rl.envs.geometry import way_around
+from dynmap_rl.envs.scene import ObstacleRanges
+from dynmap_rl.envs.scene import ObstacleScene
 from dynmap_rl.envs.tasks import get_task
-from dynmap_rl.envs.world import CONTROL_DT, WALL, WALL_RADIUS
+from dynmap_rl.envs.world import CONTROL_DT
+from dynmap_rl.envs.world import WALL
+from dynmap_rl.envs.world import WALL_RADIUS
 
 TASK = get_task("balance_reaching_obstacle")
 ANYWHERE = ObstacleRanges(

@@ -9,8 +9,10 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import dynmap_rl  # noqa: F401 (registers the ids)
-from dynmap_rl.envs.gymnasium_env import OBS_TYPES, DynmapEnv
-from dynmap_rl.envs.tasks import TASKS, get_task
+from dynmap_rl.envs.gym_env import OBS_TYPES
+from dynmap_rl.envs.gym_env import DynmapEnv
+from dynmap_rl.envs.tasks import TASKS
+from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.world import EPISODE_STEPS
 
 IDS = {

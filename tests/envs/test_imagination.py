@@ -7,18 +7,17 @@ from torchrl.collectors import Collector
 from torchrl.envs import Compose, InitTracker, RenameTransform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from dynmap_rl.data import load_dataset
-from dynmap_rl.envs import ImaginationEnv, make_start
-from dynmap_rl.evaluation import open_loop_errors
-from dynmap_rl.modules import (
-    MEMORY,
-    LatentActor,
-    Normalizer,
-    WorldModel,
-    make_policy,
-    make_policy_module,
-    make_world_model,
-)
+from dynmap_rl.data.demonstrations import load_dataset
+from dynmap_rl.envs.imagination import ImaginationEnv
+from dynmap_rl.envs.imagination import make_start
+from dynmap_rl.evaluation.open_loop import open_loop_errors
+from dynmap_rl.modules.actor import MEMORY
+from dynmap_rl.modules.actor import LatentActor
+from dynmap_rl.modules.normalization import Normalizer
+from dynmap_rl.modules.world_model import WorldModel
+from dynmap_rl.modules.checkpoints import make_policy
+from dynmap_rl.modules.actor import make_policy_module
+from dynmap_rl.modules.checkpoints import make_world_model
 
 CONSTANTS = {
     "action": {"low": [-0.02, -0.02, -0.05], "high": [0.02, 0.02, 0.05]},

@@ -7,11 +7,17 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from dynmap_rl.envs import DynmapBatchedEnv, DynmapEnv
-from dynmap_rl.envs.geometry import length, path_is_blocked, way_around
-from dynmap_rl.envs.scene import ObstacleRanges, ObstacleScene
+from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
+from dynmap_rl.envs.gym_env import DynmapEnv
+from dynmap_rl.envs.geometry import length
+from dynmap_rl.envs.geometry import path_is_blocked
+from dynmap_rl.envs.geometry import way_around
+from dynmap_rl.envs.scene import ObstacleRanges
+from dynmap_rl.envs.scene import ObstacleScene
 from dynmap_rl.envs.tasks import get_task
-from dynmap_rl.envs.world import CONTROL_DT, EPISODE_STEPS, World
+from dynmap_rl.envs.world import CONTROL_DT
+from dynmap_rl.envs.world import EPISODE_STEPS
+from dynmap_rl.envs.world import World
 
 TASK = get_task("balance_reaching_obstacle")
 BETWEEN = {"obstacle_x": 0.5, "obstacle_y": 0.5, "obstacle_length": 0.2}

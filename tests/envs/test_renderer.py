@@ -4,10 +4,14 @@ import numpy as np
 import pygame
 import pytest
 
-from dynmap_rl.envs.renderer import Renderer, box
-from dynmap_rl.envs.scene import GOAL_COLOR, Scene
-from dynmap_rl.envs.tasks import TASKS, get_task
-from dynmap_rl.envs.world import WALL, World
+from dynmap_rl.envs.renderer import Renderer
+from dynmap_rl.envs.renderer import box
+from dynmap_rl.envs.scene import GOAL_COLOR
+from dynmap_rl.envs.scene import Scene
+from dynmap_rl.envs.tasks import TASKS
+from dynmap_rl.envs.tasks import get_task
+from dynmap_rl.envs.world import WALL
+from dynmap_rl.envs.world import World
 
 TASK = get_task("balance_reaching")
 SCENE = Scene(cart_x=0.3, cart_y=0.3, goal_x=0.8, goal_y=0.7)

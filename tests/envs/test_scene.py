@@ -6,18 +6,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from dynmap_rl.envs.scene import (
-    SEEDS_PER_SPLIT,
-    SPLITS,
-    BinRanges,
-    BinScene,
-    ObstacleRanges,
-    ObstacleScene,
-    Scene,
-    SceneRanges,
-    sample_scene,
-    scene_seed,
-)
+from dynmap_rl.envs.scene import SEEDS_PER_SPLIT
+from dynmap_rl.envs.scene import SPLITS
+from dynmap_rl.envs.scene import BinRanges
+from dynmap_rl.envs.scene import BinScene
+from dynmap_rl.envs.scene import ObstacleRanges
+from dynmap_rl.envs.scene import ObstacleScene
+from dynmap_rl.envs.scene import Scene
+from dynmap_rl.envs.scene import SceneRanges
+from dynmap_rl.envs.scene import sample_scene
+from dynmap_rl.envs.scene import scene_seed
 
 every_kind = pytest.mark.parametrize("ranges", [SceneRanges(), ObstacleRanges(), BinRanges()])
 

@@ -7,7 +7,8 @@ import sys
 import numpy as np
 import pytest
 
-from dynmap_rl.envs import substeps, world
+from dynmap_rl.envs import substeps  # MODULE
+from dynmap_rl.envs import world  # MODULE
 from dynmap_rl.envs.tasks import TASKS
 
 

@@ -6,11 +6,20 @@ import numpy as np
 import pytest
 import torch
 
-from dynmap_rl.envs import DynmapBatchedEnv, DynmapEnv
-from dynmap_rl.envs.scene import BinRanges, ObstacleRanges, Scene, SceneRanges, choose_ranges
-from dynmap_rl.envs.tasks import MARKER_SIZE, TASKS, get_task
-from dynmap_rl.envs.world import ACTION_LIMIT, EPISODE_STEPS, World
-from dynmap_rl.experts import load_expert
+from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
+from dynmap_rl.envs.gym_env import DynmapEnv
+from dynmap_rl.envs.scene import BinRanges
+from dynmap_rl.envs.scene import ObstacleRanges
+from dynmap_rl.envs.scene import Scene
+from dynmap_rl.envs.scene import SceneRanges
+from dynmap_rl.envs.scene import choose_ranges
+from dynmap_rl.envs.tasks import MARKER_SIZE
+from dynmap_rl.envs.tasks import TASKS
+from dynmap_rl.envs.tasks import get_task
+from dynmap_rl.envs.world import ACTION_LIMIT
+from dynmap_rl.envs.world import EPISODE_STEPS
+from dynmap_rl.envs.world import World
+from dynmap_rl.experts.network import load_expert
 
 TASK = get_task("balance_reaching")
 STILL = np.zeros(3)

@@ -14,7 +14,7 @@ from torchrl.envs import InitTracker, ParallelEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from dynmap_rl import GYMNASIUM_IDS
-from dynmap_rl.envs import DynmapBatchedEnv
+from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.envs.tasks import TASKS
 
 every_task = pytest.mark.parametrize("task", TASKS)

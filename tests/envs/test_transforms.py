@@ -9,8 +9,13 @@ from torchrl.collectors import Collector, Evaluator
 from torchrl.envs import Compose, InitTracker, ParallelEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from dynmap_rl.envs import DynmapBatchedEnv, WorldModelTransform
-from dynmap_rl.modules import MEMORY, Actor, LatentActor, make_policy, make_world_model
+from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
+from dynmap_rl.envs.world_model_transform import WorldModelTransform
+from dynmap_rl.modules.actor import MEMORY
+from dynmap_rl.modules.actor import Actor
+from dynmap_rl.modules.actor import LatentActor
+from dynmap_rl.modules.checkpoints import make_policy
+from dynmap_rl.modules.checkpoints import make_world_model
 
 CONSTANTS = {
     "action": {"low": [-0.02, -0.02, -0.05], "high": [0.02, 0.02, 0.05]},

@@ -8,18 +8,17 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from dynmap_rl.envs.tasks import TASKS, get_task
-from dynmap_rl.envs.world import (
-    ACCELERATION_LIMIT,
-    ACTION_LIMIT,
-    CONTROL_DT,
-    GRAVITY,
-    SUBSTEPS,
-    VELOCITY_LIMIT,
-    WORKSPACE_HIGH,
-    WORKSPACE_LOW,
-    World,
-)
+from dynmap_rl.envs.tasks import TASKS
+from dynmap_rl.envs.tasks import get_task
+from dynmap_rl.envs.world import ACCELERATION_LIMIT
+from dynmap_rl.envs.world import ACTION_LIMIT
+from dynmap_rl.envs.world import CONTROL_DT
+from dynmap_rl.envs.world import GRAVITY
+from dynmap_rl.envs.world import SUBSTEPS
+from dynmap_rl.envs.world import VELOCITY_LIMIT
+from dynmap_rl.envs.world import WORKSPACE_HIGH
+from dynmap_rl.envs.world import WORKSPACE_LOW
+from dynmap_rl.envs.world import World
 
 every_task = pytest.mark.parametrize("name", TASKS)
 episodes = given(seed=st.integers(0, 2**32 - 1), wildness=st.floats(0.05, 4))

@@ -7,7 +7,8 @@ import pytest
 from commands import open_in_browser
 from PIL import Image, ImageSequence
 
-from dynmap_rl.evaluation import dataset_page, write_dataset_page
+from dynmap_rl.evaluation import dataset_page  # MODULE
+from dynmap_rl.reporting.dataset_page import write_dataset_page
 
 
 def test_it_is_whole_in_a_browser(recording, tmp_path, capsys):

@@ -4,15 +4,13 @@ import json
 
 import pytest
 
-from dynmap_rl.evaluation.findings import (
-    DROPS,
-    compare_cells,
-    list_pairs,
-    markdown_findings,
-    markdown_spread,
-    spread,
-)
-from dynmap_rl.evaluation.paper import TABLES
+from dynmap_rl.paper.findings import DROPS
+from dynmap_rl.paper.findings import compare_cells
+from dynmap_rl.paper.findings import list_pairs
+from dynmap_rl.paper.findings import markdown_findings
+from dynmap_rl.paper.findings import markdown_spread
+from dynmap_rl.paper.findings import spread
+from dynmap_rl.paper.published import TABLES
 
 TASK = "balance_reaching"
 

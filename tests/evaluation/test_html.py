@@ -7,8 +7,9 @@ import pytest
 from commands import open_in_browser
 from PIL import Image
 
-from dynmap_rl.evaluation import write_html
-from dynmap_rl.runs import append_metrics, write_json
+from dynmap_rl.reporting.html import write_html
+from dynmap_rl.runs.folder import append_metrics
+from dynmap_rl.utils.files import write_json
 
 VOID = {"meta", "img", "br", "hr", "link"}
 

@@ -6,9 +6,12 @@ from types import SimpleNamespace
 import pytest
 
 from dynmap_rl.envs.tasks import TASKS
-from dynmap_rl.evaluation import paper_numbers, shared_interval, write_report
-from dynmap_rl.evaluation.report import result_rows
-from dynmap_rl.runs import read_json, write_json
+from dynmap_rl.paper.published import paper_numbers
+from dynmap_rl.evaluation.statistics import shared_interval
+from dynmap_rl.reporting.run_page import write_report
+from dynmap_rl.evaluation.protocol import result_rows
+from dynmap_rl.utils.files import read_json
+from dynmap_rl.utils.files import write_json
 
 
 def row(task, training, policy, name, trained_on="balance_reaching") -> dict:

@@ -2,10 +2,17 @@ import numpy as np
 import pytest
 import torch
 
-from dynmap_rl.envs.tasks import TASKS, get_task
+from dynmap_rl.envs.tasks import TASKS
+from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.world import EPISODE_STEPS
-from dynmap_rl.evaluation import episode_rows, evaluate, failures_first, roll_out, scene_seeds
-from dynmap_rl.modules import Actor, make_policy, make_world_model
+from dynmap_rl.evaluation.rollout import episode_rows
+from dynmap_rl.evaluation.protocol import evaluate
+from dynmap_rl.evaluation.rollout import failures_first
+from dynmap_rl.evaluation.rollout import roll_out
+from dynmap_rl.evaluation.rollout import scene_seeds
+from dynmap_rl.modules.actor import Actor
+from dynmap_rl.modules.checkpoints import make_policy
+from dynmap_rl.modules.checkpoints import make_world_model
 
 CONSTANTS = {
     "action": {"low": [-0.02, -0.02, -0.05], "high": [0.02, 0.02, 0.05]},

@@ -2,15 +2,13 @@ import numpy as np
 import pytest
 from scipy.stats import permutation_test
 
-from dynmap_rl.evaluation import (
-    parse_supervision,
-    rate_gap,
-    row_name,
-    shared_interval,
-    summarize,
-    summarize_seeds,
-    wilson,
-)
+from dynmap_rl.modules.supervision import parse_supervision
+from dynmap_rl.evaluation.statistics import rate_gap
+from dynmap_rl.modules.supervision import row_name
+from dynmap_rl.evaluation.statistics import shared_interval
+from dynmap_rl.evaluation.statistics import summarize
+from dynmap_rl.evaluation.statistics import summarize_seeds
+from dynmap_rl.evaluation.statistics import wilson
 from dynmap_rl.evaluation.statistics import exchange_p
 
 

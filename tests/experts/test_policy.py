@@ -11,20 +11,20 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from dynmap_rl.envs import DynmapBatchedEnv, scene_seed
-from dynmap_rl.envs.tasks import TASKS, get_task
+from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
+from dynmap_rl.envs.scene import scene_seed
+from dynmap_rl.envs.tasks import TASKS
+from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.world import ACCELERATION_LIMIT
-from dynmap_rl.experts import (
-    ExpertNetwork,
-    film,
-    list_checkpoints,
-    load_expert,
-    make_actor,
-    roll_out,
-    task_of_expert,
-)
-from dynmap_rl.experts.policy import CHECKPOINTS
-from dynmap_rl.runs import read_json
+from dynmap_rl.experts.network import ExpertNetwork
+from dynmap_rl.reporting.media import film
+from dynmap_rl.experts.network import list_checkpoints
+from dynmap_rl.experts.network import load_expert
+from dynmap_rl.experts.network import make_actor
+from dynmap_rl.experts.network import roll_out
+from dynmap_rl.experts.network import task_of_expert
+from dynmap_rl.experts.network import CHECKPOINTS
+from dynmap_rl.utils.files import read_json
 
 TASK = "balance_reaching"
 RESULTS = Path(__file__).parents[2] / "recipes/results"

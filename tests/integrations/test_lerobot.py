@@ -14,13 +14,15 @@ from lerobot.scripts.lerobot_eval import rollout
 from tensordict import TensorDict
 from torch import nn
 
-from dynmap_rl import modules
-from dynmap_rl.data import load_dataset, load_meta
-from dynmap_rl.envs import DynmapBatchedEnv
-from dynmap_rl.evaluation import scene_seeds
-from dynmap_rl.integrations.lerobot import DynmapConfig, DynmapEnvConfig
+from dynmap_rl import modules  # MODULE
+from dynmap_rl.data.demonstrations import load_dataset
+from dynmap_rl.data.demonstrations import load_meta
+from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
+from dynmap_rl.evaluation.rollout import scene_seeds
+from dynmap_rl.integrations.lerobot.configuration_dynmap import DynmapConfig
+from dynmap_rl.integrations.lerobot.environment import DynmapEnvConfig
 from dynmap_rl.integrations.lerobot.modeling_dynmap import DynmapPolicy
-from dynmap_rl.weights import fingerprint
+from dynmap_rl.utils.weights import fingerprint
 
 TASKS = ("balance_reaching", "balance_reaching_obstacle", "bin_dropping")
 SMALL = {"device": "cpu", "push_to_hub": False, "window_steps": 6, "rgb_steps": 2}

@@ -11,7 +11,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from dynmap_rl.data import load_dataset
+from dynmap_rl.data.demonstrations import load_dataset
 
 PLUGIN = "discover_packages_path=dynmap_rl.integrations.lerobot"
 TASKS = ("balance_reaching", "balance_reaching_obstacle", "bin_dropping")

@@ -5,17 +5,16 @@ import torch
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_policy, make_policy_config, make_pre_post_processors
 
-from dynmap_rl import modules
-from dynmap_rl.frozen import load_source
-from dynmap_rl.integrations.lerobot import (
-    DynmapConfig,
-    DynmapEnvConfig,
-    export_to_lerobot,
-    import_from_lerobot,
-)
+from dynmap_rl import modules  # MODULE
+from dynmap_rl.runs.lookup import load_source
+from dynmap_rl.integrations.lerobot.configuration_dynmap import DynmapConfig
+from dynmap_rl.integrations.lerobot.environment import DynmapEnvConfig
+from dynmap_rl.integrations.lerobot.export import export_to_lerobot
+from dynmap_rl.integrations.lerobot.export import import_from_lerobot
 from dynmap_rl.integrations.lerobot.modeling_dynmap import DynmapPolicy
-from dynmap_rl.runs import read_json, write_json
-from dynmap_rl.weights import fingerprint
+from dynmap_rl.utils.files import read_json
+from dynmap_rl.utils.files import write_json
+from dynmap_rl.utils.weights import fingerprint
 
 
 def make_run(folder, kind, keypoints=False, goal=2):

@@ -5,9 +5,11 @@ from torchrl.collectors import Collector
 from torchrl.envs import Compose, InitTracker, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from dynmap_rl.envs import DynmapBatchedEnv
-from dynmap_rl.evaluation import roll_out
-from dynmap_rl.modules import Actor, make_policy, make_world_model
+from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
+from dynmap_rl.evaluation.rollout import roll_out
+from dynmap_rl.modules.actor import Actor
+from dynmap_rl.modules.checkpoints import make_policy
+from dynmap_rl.modules.checkpoints import make_world_model
 
 CONSTANTS = {
     "action": {"low": [-0.02, -0.02, -0.05], "high": [0.02, 0.02, 0.05]},

@@ -3,20 +3,18 @@ import torch
 from tensordict import TensorDict
 from torch.nn.functional import pixel_shuffle, pixel_unshuffle
 
-from dynmap_rl.modules import (
-    DYNAMICS,
-    Encoder,
-    Normalizer,
-    delay,
-    load_policy,
-    load_world_model,
-    make_policy,
-    make_policy_module,
-    make_world_model,
-    make_world_model_module,
-    save_policy,
-    save_world_model,
-)
+from dynmap_rl.modules.decoder import DYNAMICS
+from dynmap_rl.modules.encoder import Encoder
+from dynmap_rl.modules.normalization import Normalizer
+from dynmap_rl.modules.recurrent import delay
+from dynmap_rl.modules.checkpoints import load_policy
+from dynmap_rl.modules.checkpoints import load_world_model
+from dynmap_rl.modules.checkpoints import make_policy
+from dynmap_rl.modules.actor import make_policy_module
+from dynmap_rl.modules.checkpoints import make_world_model
+from dynmap_rl.modules.actor import make_world_model_module
+from dynmap_rl.modules.checkpoints import save_policy
+from dynmap_rl.modules.checkpoints import save_world_model
 from dynmap_rl.modules.layers import to_blocks
 
 CONSTANTS = {

@@ -4,8 +4,14 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from dynmap_rl.modules import make_policy, make_policy_module, make_world_model, make_world_model_module
-from dynmap_rl.objectives import ImitationLoss, JointLoss, WorldModelLoss, imitation_loss
+from dynmap_rl.modules.checkpoints import make_policy
+from dynmap_rl.modules.actor import make_policy_module
+from dynmap_rl.modules.checkpoints import make_world_model
+from dynmap_rl.modules.actor import make_world_model_module
+from dynmap_rl.objectives.imitation import ImitationLoss
+from dynmap_rl.objectives.joint import JointLoss
+from dynmap_rl.objectives.world_model import WorldModelLoss
+from dynmap_rl.objectives.imitation import imitation_loss
 
 CONSTANTS = {
     "action": {"low": [-0.02, -0.02, -0.05], "high": [0.02, 0.02, 0.05]},

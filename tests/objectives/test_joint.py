@@ -4,8 +4,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from dynmap_rl.modules import make_policy, make_world_model
-from dynmap_rl.objectives import JointLoss, WorldModelLoss, imitation_loss
+from dynmap_rl.modules.checkpoints import make_policy
+from dynmap_rl.modules.checkpoints import make_world_model
+from dynmap_rl.objectives.joint import JointLoss
+from dynmap_rl.objectives.world_model import WorldModelLoss
+from dynmap_rl.objectives.imitation import imitation_loss
 
 CONSTANTS = {
     "action": {"low": [-0.02, -0.02, -0.05], "high": [0.02, 0.02, 0.05]},

@@ -3,8 +3,11 @@ import torch
 from tensordict import TensorDict
 from torch.nn.functional import pixel_unshuffle
 
-from dynmap_rl.modules import DYNAMICS, Normalizer, make_world_model
-from dynmap_rl.objectives import WorldModelLoss, imitation_loss
+from dynmap_rl.modules.decoder import DYNAMICS
+from dynmap_rl.modules.normalization import Normalizer
+from dynmap_rl.modules.checkpoints import make_world_model
+from dynmap_rl.objectives.world_model import WorldModelLoss
+from dynmap_rl.objectives.imitation import imitation_loss
 from dynmap_rl.objectives.world_model import rms
 
 CONSTANTS = {

@@ -5,12 +5,16 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from dynmap_rl.data import load_meta
-from dynmap_rl.envs import DynmapBatchedEnv, scene_seed
+from dynmap_rl.data.demonstrations import load_meta
+from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
+from dynmap_rl.envs.scene import scene_seed
 from dynmap_rl.envs.tasks import TASKS
-from dynmap_rl.evaluation import roll_out
-from dynmap_rl.modules import Actor, make_policy, make_world_model
-from dynmap_rl.play import Hand, Session
+from dynmap_rl.evaluation.rollout import roll_out
+from dynmap_rl.modules.actor import Actor
+from dynmap_rl.modules.checkpoints import make_policy
+from dynmap_rl.modules.checkpoints import make_world_model
+from dynmap_rl.play.session import Hand
+from dynmap_rl.play.session import Session
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ import torch
 from commands import run
 from foreign_dataset import CAMERA, FPS, make_foreign
 
-from dynmap_rl.data import load_dataset
+from dynmap_rl.data.demonstrations import load_dataset
 from recipes.add_dynamics import Config, main
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "add_dynamics.py"
@@ -53,7 +53,7 @@ def pair(request):
 
 
 def open_with_lerobot(root):
-    from dynmap_rl.data.writing import quiet
+    from dynmap_rl.data.format.writing import quiet
 
     with quiet():
         from lerobot.datasets import LeRobotDataset

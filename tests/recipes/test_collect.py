@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from commands import run
 
-from dynmap_rl.data import load_dataset
+from dynmap_rl.data.demonstrations import load_dataset
 from dynmap_rl.envs.tasks import TASKS
 from recipes.collect import Config, main
 

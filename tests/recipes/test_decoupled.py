@@ -10,7 +10,7 @@ from commands import open_in_browser, run
 from safetensors.torch import load_file, save_file
 
 from dynmap_rl.envs.tasks import TASKS
-from dynmap_rl.settings import find_or_record
+from dynmap_rl.training.dataset import find_or_record
 from recipes.decoupled import Config, main
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "decoupled.py"

@@ -4,12 +4,16 @@ import pytest
 import torch
 from commands import run
 
-from dynmap_rl.data import load_meta
-from dynmap_rl.envs import scene_seed
-from dynmap_rl.experts import list_checkpoints
-from dynmap_rl.experts.policy import CHECKPOINTS
-from dynmap_rl.modules import make_policy, make_world_model, save_policy, save_world_model
-from dynmap_rl.runs import read_json, write_json
+from dynmap_rl.data.demonstrations import load_meta
+from dynmap_rl.envs.scene import scene_seed
+from dynmap_rl.experts.network import list_checkpoints
+from dynmap_rl.experts.network import CHECKPOINTS
+from dynmap_rl.modules.checkpoints import make_policy
+from dynmap_rl.modules.checkpoints import make_world_model
+from dynmap_rl.modules.checkpoints import save_policy
+from dynmap_rl.modules.checkpoints import save_world_model
+from dynmap_rl.utils.files import read_json
+from dynmap_rl.utils.files import write_json
 from recipes.evaluate import Config, main
 
 

@@ -9,8 +9,8 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from dynmap_rl import runs
-from dynmap_rl.experts import ppo
+from dynmap_rl import runs  # MODULE
+from dynmap_rl.experts import ppo  # MODULE
 from recipes.expert import Config, main
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "expert.py"

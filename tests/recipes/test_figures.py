@@ -7,13 +7,19 @@ import pytest
 from commands import run
 from PIL import Image
 
-from dynmap_rl import data, evaluation
-from dynmap_rl.cells import list_cells
-from dynmap_rl.data import load_meta
-from dynmap_rl.evaluation import scene_seeds
-from dynmap_rl.evaluation.paper_figures import loss_panels
-from dynmap_rl.modules import make_policy, make_world_model, save_policy, save_world_model
-from dynmap_rl.runs import append_metrics, read_json, write_json
+from dynmap_rl import data  # MODULE
+from dynmap_rl import evaluation  # MODULE
+from dynmap_rl.paper.cells import list_cells
+from dynmap_rl.data.demonstrations import load_meta
+from dynmap_rl.evaluation.rollout import scene_seeds
+from dynmap_rl.paper.figures import loss_panels
+from dynmap_rl.modules.checkpoints import make_policy
+from dynmap_rl.modules.checkpoints import make_world_model
+from dynmap_rl.modules.checkpoints import save_policy
+from dynmap_rl.modules.checkpoints import save_world_model
+from dynmap_rl.runs.folder import append_metrics
+from dynmap_rl.utils.files import read_json
+from dynmap_rl.utils.files import write_json
 from recipes.figures import POLICIES, WORLD_MODEL, Config, main
 
 

@@ -6,9 +6,11 @@ import pytest
 import torch
 from foreign_dataset import make_foreign
 
-from dynmap_rl.data import add_dynamics
-from dynmap_rl.modules import load_policy, load_world_model
-from dynmap_rl.runs import read_json, read_metrics
+from dynmap_rl.data.derive import add_dynamics
+from dynmap_rl.modules.checkpoints import load_policy
+from dynmap_rl.modules.checkpoints import load_world_model
+from dynmap_rl.utils.files import read_json
+from dynmap_rl.runs.folder import read_metrics
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 

@@ -5,10 +5,11 @@ import pytest
 from commands import place_recordings, run
 from safetensors.torch import load_file, save_file
 
-from dynmap_rl.data import load_meta
-from dynmap_rl.frozen import load_source
-from dynmap_rl.runs import read_json, write_json
-from dynmap_rl.weights import fingerprint
+from dynmap_rl.data.demonstrations import load_meta
+from dynmap_rl.runs.lookup import load_source
+from dynmap_rl.utils.files import read_json
+from dynmap_rl.utils.files import write_json
+from dynmap_rl.utils.weights import fingerprint
 from recipes.generalize import Config, main
 
 

@@ -3,8 +3,9 @@
 import pytest
 from commands import place_recordings, run
 
-from dynmap_rl.modules import FeedforwardPolicy, load_actor
-from dynmap_rl.runs import read_json
+from dynmap_rl.modules.policy import FeedforwardPolicy
+from dynmap_rl.runs.lookup import load_actor
+from dynmap_rl.utils.files import read_json
 
 
 @pytest.mark.parametrize(

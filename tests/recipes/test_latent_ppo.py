@@ -6,10 +6,11 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from dynmap_rl import modules, runs
+from dynmap_rl import modules  # MODULE
+from dynmap_rl import runs  # MODULE
 from dynmap_rl.envs.world import ACCELERATION_LIMIT
-from dynmap_rl.evaluation import roll_out as roll_out_actor
-from dynmap_rl.experts import ExpertNetwork
+from dynmap_rl.evaluation.rollout import roll_out as roll_out_actor
+from dynmap_rl.experts.network import ExpertNetwork
 from recipes.latent_ppo import Config, main, make_env, roll_out
 
 CONSTANTS = {

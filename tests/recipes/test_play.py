@@ -8,13 +8,21 @@ import pytest
 from commands import run
 from PIL import Image, ImageSequence
 
-from dynmap_rl.data import keep_episode, load_dataset, load_meta, publish_episodes
-from dynmap_rl.data.human import next_scene
-from dynmap_rl.envs import scene_seed
+from dynmap_rl.data.recording.human import keep_episode
+from dynmap_rl.data.demonstrations import load_dataset
+from dynmap_rl.data.demonstrations import load_meta
+from dynmap_rl.data.recording.human import publish_episodes
+from dynmap_rl.data.recording.human import next_scene
+from dynmap_rl.envs.scene import scene_seed
 from dynmap_rl.envs.renderer import pygame
-from dynmap_rl.modules import make_policy, make_world_model, save_policy, save_world_model
-from dynmap_rl.play import PlayWindow, Session, session
-from dynmap_rl.runs import write_json
+from dynmap_rl.modules.checkpoints import make_policy
+from dynmap_rl.modules.checkpoints import make_world_model
+from dynmap_rl.modules.checkpoints import save_policy
+from dynmap_rl.modules.checkpoints import save_world_model
+from dynmap_rl.play.window import PlayWindow
+from dynmap_rl.play.session import Session
+from dynmap_rl.play import session  # MODULE
+from dynmap_rl.utils.files import write_json
 from recipes.play import save_film
 
 
@@ -119,7 +127,7 @@ def test_what_a_person_drove_becomes_a_dataset(tmp_path, monkeypatch):
     """Here the person does what the expert would."""
     monkeypatch.setattr(session.Session, "_hand_action", session.Session._expert_action)
     pushed = []
-    monkeypatch.setattr("dynmap_rl.data.push_dataset", lambda *arguments: pushed.append(arguments))
+    monkeypatch.setattr("dynmap_rl.data.format.hub.push_dataset", lambda *arguments: pushed.append(arguments))
     arguments = "--driver", "hand", "--record", "mine", "--steps", 141 + 120, "--size", 64
     result = run(tmp_path, "play", *arguments, "--push_to_hub", "someone/mine")
     assert result.returncode == 0, result.stderr

@@ -4,10 +4,13 @@ import pytest
 import torch
 from commands import run
 
-from dynmap_rl.data import load_dataset, load_meta
-from dynmap_rl.evaluation import probing
-from dynmap_rl.modules import make_world_model, save_world_model
-from dynmap_rl.runs import read_json, write_json
+from dynmap_rl.data.demonstrations import load_dataset
+from dynmap_rl.data.demonstrations import load_meta
+from dynmap_rl.evaluation import probing  # MODULE
+from dynmap_rl.modules.checkpoints import make_world_model
+from dynmap_rl.modules.checkpoints import save_world_model
+from dynmap_rl.utils.files import read_json
+from dynmap_rl.utils.files import write_json
 
 
 @pytest.fixture(scope="module")

@@ -15,9 +15,11 @@ import commands
 import pytest
 from filelock import FileLock
 
-from dynmap_rl.cells import list_cells
-from dynmap_rl.evaluation.paper import TABLES, parse_supervision, row_name
-from dynmap_rl.evaluation.tables import COLUMNS
+from dynmap_rl.paper.cells import list_cells
+from dynmap_rl.paper.published import TABLES
+from dynmap_rl.modules.supervision import parse_supervision
+from dynmap_rl.modules.supervision import row_name
+from dynmap_rl.paper.tables import COLUMNS
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "tables.py"
 

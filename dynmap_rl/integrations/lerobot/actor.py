@@ -11,8 +11,8 @@ from lerobot.utils.constants import OBS_STATE
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from dynmap_rl.data.loading import CAMERA
-from dynmap_rl.hub import first_line
+from dynmap_rl.data.demonstrations import CAMERA
+from dynmap_rl.utils.hub import first_line
 
 
 class LeRobotActor(TensorDictModuleBase):

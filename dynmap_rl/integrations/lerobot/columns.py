@@ -10,8 +10,8 @@ import pyarrow.parquet as pq
 import torch
 from tensordict import TensorDict
 
-from dynmap_rl.data import load_meta, normalization_constants
-from dynmap_rl.data.loading import META, NEEDED
+from dynmap_rl.data.demonstrations import META, NEEDED, load_meta
+from dynmap_rl.data.recording.shards import normalization_constants
 from dynmap_rl.envs.tasks import get_task
 
 

@@ -8,9 +8,9 @@ from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 
-from dynmap_rl.data.loading import FRAME_SHAPE
-from dynmap_rl.evaluation.paper import parse_supervision
-from dynmap_rl.modules import check_policy
+from dynmap_rl.data.demonstrations import FRAME_SHAPE
+from dynmap_rl.modules.checkpoints import check_policy
+from dynmap_rl.modules.supervision import parse_supervision
 
 
 @PreTrainedConfig.register_subclass("dynmap")

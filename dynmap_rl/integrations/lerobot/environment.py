@@ -13,13 +13,12 @@ from lerobot.envs.utils import NEW_ROLLOUT_OPTION
 from lerobot.processor import PolicyProcessorPipeline, RenameObservationsProcessorStep
 from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 
-from dynmap_rl import GYMNASIUM_IDS
-from dynmap_rl.data.loading import CAMERA, FRAME_SHAPE
-from dynmap_rl.data.writing import FPS
-from dynmap_rl.envs import scene_seed
+from dynmap_rl.keys import GYMNASIUM_IDS
+from dynmap_rl.data.demonstrations import CAMERA, FRAME_SHAPE
+from dynmap_rl.data.format.writing import FPS
+from dynmap_rl.envs.scene import scene_seed
 from dynmap_rl.envs.world import EPISODE_STEPS
 
-IDS = {task: name for name, task in GYMNASIUM_IDS.items()}
 
 
 @EnvConfig.register_subclass("dynmap")
@@ -55,8 +54,8 @@ class DynmapEnvConfig(EnvConfig):
     )
 
     def __post_init__(self):
-        if self.task not in IDS:
-            raise ValueError(f"--env.task is one of {', '.join(IDS)}, not {self.task!r}")
+        if self.task not in GYMNASIUM_IDS:
+            raise ValueError(f"--env.task is one of {', '.join(GYMNASIUM_IDS)}, not {self.task!r}")
         scene_seed(self.split, 0)
         if (self.fps, self.episode_length) != (FPS, EPISODE_STEPS):
             raise ValueError(f"episodes of {self.task} have {EPISODE_STEPS} steps at {FPS} Hz")
@@ -67,7 +66,7 @@ class DynmapEnvConfig(EnvConfig):
 
     @property
     def gym_id(self) -> str:
-        return IDS[self.task]
+        return GYMNASIUM_IDS[self.task]
 
     @property
     def gym_kwargs(self) -> dict:

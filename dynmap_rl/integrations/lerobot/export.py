@@ -7,12 +7,14 @@ from pathlib import Path
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.utils.constants import ACTION, OBS_STATE
 
-from dynmap_rl import modules, runs
-from dynmap_rl.data.loading import CAMERA, FRAME_SHAPE
-
+from dynmap_rl.data.demonstrations import CAMERA, FRAME_SHAPE
 from .configuration_dynmap import DynmapConfig
 from .modeling_dynmap import SIZES, DynmapPolicy
 from .processor_dynmap import make_dynmap_pre_post_processors
+from dynmap_rl.modules.checkpoints import save_policy, save_world_model
+from dynmap_rl.modules.policy import RecurrentPolicy
+from dynmap_rl.runs.lookup import find_run, load_actor
+from dynmap_rl.utils.files import read_json, write_json
 
 
 def export_to_lerobot(run: str | Path, folder: str | Path, seed: int = 0) -> Path:
@@ -28,20 +30,20 @@ def export_to_lerobot(run: str | Path, folder: str | Path, seed: int = 0) -> Pat
     Raises:
         ValueError: the run holds no such policy, or one of another scene than ours.
     """
-    folder, run = Path(folder), modules.find_run(run)
-    actor = modules.load_actor(run, seed)
+    folder, run = Path(folder), find_run(run)
+    actor = load_actor(run, seed)
     world_model, policy = actor.world_model, actor.policy
     sizes = {"action": policy.action.size, "goal": policy.goal.size}
     sizes |= {name: n.size for name, n in world_model.dynamics_decoder.normalizers.items()}
     if other := {name: size for name, size in sizes.items() if size != SIZES[name]}:
         raise ValueError(f"{run} is of another scene than ours, by the sizes of {other}")
     files = run / "config.json", run / "eval.json"
-    settings, results = (runs.read_json(file) if file.exists() else {} for file in files)
+    settings, results = (read_json(file) if file.exists() else {} for file in files)
     config = DynmapConfig(
         task=settings.get("task"),
         source=results.get("world_model"),
         supervision=",".join(world_model.supervision) or "none",
-        kind="recurrent" if isinstance(policy, modules.RecurrentPolicy) else "feedforward",
+        kind="recurrent" if isinstance(policy, RecurrentPolicy) else "feedforward",
         latent_size=world_model.latent_size,
         hidden_size=world_model.hidden_size,
         keypoints=world_model.keypoints,
@@ -84,12 +86,12 @@ def import_from_lerobot(folder: str | Path, run: str | Path, seed: int = 0) -> P
         raise ValueError(f"{folder} holds a policy of the type {config.type}, not dynmap")
     source = config.source or {}
     settings = {"task": config.task} | ({"dataset": source["dataset"]} if "dataset" in source else {})
-    if (run / "config.json").exists() and runs.read_json(run / "config.json") != settings:
+    if (run / "config.json").exists() and read_json(run / "config.json") != settings:
         raise ValueError(f"{run} holds another run; choose another folder")
     policy = DynmapPolicy.from_pretrained(folder, config=config, strict=True)
-    runs.write_json(run / "config.json", settings)
-    modules.save_world_model(run / "world_model", policy.world_model)
-    modules.save_policy(run / f"seed_{seed}" / "policy", policy.policy, policy.world_model)
+    write_json(run / "config.json", settings)
+    save_world_model(run / "world_model", policy.world_model)
+    save_policy(run / f"seed_{seed}" / "policy", policy.policy, policy.world_model)
     if source:
-        runs.write_json(run / "eval.json", {"world_model": source, "imported_from": str(folder)})
+        write_json(run / "eval.json", {"world_model": source, "imported_from": str(folder)})
     return run

@@ -9,13 +9,15 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_STATE
 from tensordict import TensorDict
 
-from dynmap_rl.data import add_distractors, augment
-from dynmap_rl.evaluation.paper import parse_supervision
-from dynmap_rl.modules import DYNAMICS, make_policy, make_world_model, mixed_precision
-from dynmap_rl.objectives import JointLoss, WorldModelLoss
-
+from dynmap_rl.data.augmentation import add_distractors, augment
 from .columns import find_constants, find_task, is_symmetric, read_columns
 from .configuration_dynmap import DynmapConfig
+from dynmap_rl.modules.checkpoints import make_policy, make_world_model
+from dynmap_rl.keys import DYNAMICS
+from dynmap_rl.modules.precision import mixed_precision
+from dynmap_rl.modules.supervision import parse_supervision
+from dynmap_rl.objectives.joint import JointLoss
+from dynmap_rl.objectives.world_model import WorldModelLoss
 
 SIZES = {"action": 3, "goal": 2, **dict.fromkeys(DYNAMICS, 6)}
 

@@ -1,0 +1,130 @@
+"""A copy of a LeRobot v3.0 dataset with further columns and their statistics.
+
+``lerobot.datasets.dataset_tools.add_features`` writes no statistics of the new columns, neither of the set nor of its
+episodes, is slow where frames are images, and leaves a half-written folder behind when it is stopped.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from .reading import spans
+from .writing import quiet
+from dynmap_rl.utils.files import read_json, write_json
+
+
+def write_columns(
+    root: Path,
+    output: Path,
+    info: dict,
+    table: pa.Table,
+    values: dict[str, np.ndarray],
+    names: list[str],
+    without: tuple[str, ...] = (),
+) -> None:
+    """Copy the dataset to a new folder, which appears when it is whole, with columns that it gets or that it replaces.
+
+    Args:
+        info: the content of its ``meta/info.json``.
+        table: ``index`` and ``episode_index`` of all frames, in order.
+        values: the columns, float32 ``[N, D]``.
+        names: of their entries.
+        without: files that are left out.
+
+    Raises:
+        OSError: the folder cannot be written.
+    """
+    temporary = output.with_name(f"{output.name}.tmp")
+    try:
+        shutil.rmtree(temporary, ignore_errors=True)
+        for file in sorted(path for path in root.rglob("*") if path.is_file()):
+            relative = file.relative_to(root)
+            # Beginning with a dot: the hub's notes on a download.
+            if relative.parts[0].startswith(".") or str(relative) in without:
+                continue
+            target = temporary / relative
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if relative.parts[0] == "data":
+                _write_rows(file, target, table["index"].to_numpy(), values)
+            elif relative.parts[:2] == ("meta", "episodes"):
+                _write_episodes(file, target, dict(spans(table["episode_index"].to_numpy())), values)
+            elif relative.parts[0] == "videos":
+                _link(file, target)
+            else:
+                shutil.copy2(file, target)
+        shape = [len(names)]
+        features = {name: {"dtype": "float32", "shape": shape, "names": names} for name in values}
+        write_json(temporary / "meta" / "info.json", info | {"features": info["features"] | features})
+        _write_stats(temporary / "meta" / "stats.json", values)
+        temporary.replace(output)
+    except OSError as error:
+        raise OSError(
+            f"cannot write {output} ({error}); is there space, and may the folder be written?"
+        ) from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _write_rows(file: Path, target: Path, index: np.ndarray, values: dict[str, np.ndarray]) -> None:
+    """A data file with the new columns; one row group an episode, as LeRobot writes them."""
+    with quiet():
+        from lerobot.datasets.io_utils import write_table_one_row_group_per_episode
+
+    rows = pq.ParquetFile(file).read()
+    place = np.searchsorted(index, rows["index"].to_numpy())
+    rows = rows.drop_columns([name for name in values if name in rows.column_names])
+    for name, numbers in values.items():
+        size = numbers.shape[1]
+        flat = pa.array(numbers[place].ravel())
+        rows = rows.append_column(name, pa.FixedSizeListArray.from_arrays(flat, size) if size > 1 else flat)
+    write_table_one_row_group_per_episode(_name_columns(rows), target)
+
+
+def _name_columns(rows: pa.Table) -> pa.Table:
+    """Bring the hub's own description of the columns up to date: its viewer refuses others."""
+    from datasets import Features
+
+    if b"huggingface" not in (rows.schema.metadata or {}):
+        return rows
+    return rows.replace_schema_metadata(Features.from_arrow_schema(rows.schema).arrow_schema.metadata)
+
+
+def _write_episodes(
+    file: Path, target: Path, rows_of: dict[int, slice], values: dict[str, np.ndarray]
+) -> None:
+    """The episodes' metadata with their statistics of the new columns."""
+    rows = pq.ParquetFile(file).read()
+    old = tuple(f"stats/{name}/" for name in values)
+    rows = rows.drop_columns([name for name in rows.column_names if name.startswith(old)])
+    for name, numbers in values.items():
+        stats = [_compute_stats(numbers[rows_of[e]]) for e in rows["episode_index"].to_pylist()]
+        for key in stats[0]:
+            rows = rows.append_column(f"stats/{name}/{key}", pa.array([s[key].tolist() for s in stats]))
+    pq.write_table(rows, target)
+
+
+def _write_stats(path: Path, values: dict[str, np.ndarray]) -> None:
+    stats = read_json(path) if path.exists() else {}
+    for name, numbers in values.items():
+        stats[name] = {key: value.tolist() for key, value in _compute_stats(numbers).items()}
+    path.write_text(json.dumps(stats, indent=4))
+
+
+def _compute_stats(numbers: np.ndarray) -> dict[str, np.ndarray]:
+    from lerobot.datasets.compute_stats import get_feature_stats
+
+    return get_feature_stats(numbers.astype(np.float64), axis=0, keepdims=False)  # float32 is not enough
+
+
+def _link(file: Path, target: Path) -> None:
+    try:
+        os.link(file.resolve(), target)
+    except OSError:
+        shutil.copy2(file, target)

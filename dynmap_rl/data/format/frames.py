@@ -1,0 +1,137 @@
+"""Frames of any LeRobot v3.0 dataset, images or videos, one episode after the other."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pyarrow as pa
+
+from .reading import decode_image, image_files, read_file, spans
+from dynmap_rl.utils.hub import first_line
+
+TOLERANCE = 1e-4  # s, LeRobot's own, between a timestamp and the video's frame
+PLACE = "chunk_index", "file_index", "from_timestamp"  # of an episode in the video files
+BLOCK = 100  # frames decoded at a time: full-sized ones of a whole episode may not fit into memory
+
+
+def choose_camera(root: Path, info: dict, camera: str | None = None) -> str:
+    """The camera's column, by default the first of the dataset's features.
+
+    Raises:
+        ValueError: there is none, or none of that name.
+    """
+    cameras = [name for name, f in info["features"].items() if f["dtype"] in ("image", "video")]
+    if not cameras:
+        raise ValueError(f"{root} has no camera: no feature is an image or a video")
+    if camera not in (None, *cameras):
+        raise ValueError(f"{root} has no camera {camera!r}; choose --camera from {', '.join(cameras)}")
+    return camera or cameras[0]
+
+
+def iterate_frames(
+    root: Path, info: dict, camera: str, size: tuple[int, int] | None = None, widest: int | None = None
+) -> Iterator[tuple[int, np.ndarray, float]]:
+    """The frames of every episode.
+
+    Args:
+        size: width and height that frames are resized to, whatever their own aspect is.
+        widest: width that frames are reduced to if they are wider, in the place of ``size``.
+
+    Frames are made smaller with ``cv2.INTER_AREA``, which averages, and larger with ``cv2.INTER_LINEAR``.
+
+    Yields:
+        The episode's index, its frames uint8 ``[T, height, width, 3]`` (RGB), and the width that they had over the one
+        they have now.
+
+    Raises:
+        ValueError: a file is damaged; the message names it.
+    """
+    video = info["features"][camera]["dtype"] == "video"
+    episodes = _read_episodes(root, camera) if video else {}
+    columns = ["episode_index", "timestamp", *([] if video else [camera])]
+    largest = math.prod(info["features"][camera]["shape"])
+    for file in sorted((root / "data").glob("*/*.parquet")):
+        table = read_file(file, columns)
+        for episode, span in spans(table["episode_index"].to_numpy()):
+            rows = table.slice(span.start, span.stop - span.start)
+            blocks = (
+                _decode_video(root, info, episodes, camera, rows)
+                if video
+                else _decode(file, camera, rows, largest)
+            )
+            frames = []
+            for block in blocks:
+                width = block[0].shape[1]
+                frames += [_resize(frame, size or _reduced(frame, widest)) for frame in block]
+            yield episode, np.stack(frames), width / frames[0].shape[1]
+
+
+def _read_episodes(root: Path, camera: str) -> dict[int, dict]:
+    """Where each episode's frames are in the video files."""
+    files = sorted((root / "meta" / "episodes").glob("*/*.parquet"))
+    names = ["episode_index", *(f"videos/{camera}/{key}" for key in PLACE)]
+    return {row["episode_index"]: row for file in files for row in read_file(file, names).to_pylist()}
+
+
+def _decode(file: Path, camera: str, rows: pa.Table, largest: int) -> Iterator[list[np.ndarray]]:
+    images = image_files(file, camera, rows[camera])
+    for start in range(0, len(images), BLOCK):
+        block = []
+        for row in range(start, min(start + BLOCK, len(images))):
+            try:
+                block.append(decode_image(images[row].as_buffer(), largest))
+            except ValueError as error:
+                episode = rows["episode_index"][0].as_py()
+                raise ValueError(
+                    f"{file}: frame {row} of episode {episode} {error}; restore the dataset"
+                ) from error
+        yield block
+
+
+def _decode_video(
+    root: Path, info: dict, episodes: dict, camera: str, rows: pa.Table
+) -> Iterator[np.ndarray]:
+    from .writing import quiet
+
+    with quiet():
+        from lerobot.datasets.video_utils import decode_video_frames
+
+    try:
+        episode = episodes[rows["episode_index"][0].as_py()]
+        chunk, number, start = (episode[f"videos/{camera}/{key}"] for key in PLACE)
+        path = Path(info["video_path"].format(video_key=camera, chunk_index=chunk, file_index=number))
+        times = start + rows["timestamp"].to_numpy().astype(np.float64)
+    except (AttributeError, LookupError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{root} does not say where its videos are ({error}); restore the dataset"
+        ) from error
+    if path.is_absolute() or ".." in path.parts:
+        raise ValueError(f"{root} names a video outside of itself, {path}; restore the dataset")
+    path = root / path
+    for start in range(0, len(times), BLOCK):
+        some = times[start : start + BLOCK].tolist()
+        try:
+            # PyAV comes with its own FFmpeg; torchcodec needs the system's.
+            frames = decode_video_frames(path, some, TOLERANCE, backend="pyav", return_uint8=True)
+        except Exception as error:  # of LeRobot or of the FFmpeg below it
+            reason = first_line(error)
+            raise ValueError(f"{path} cannot be decoded ({reason}); restore the dataset") from error
+        yield frames.permute(0, 2, 3, 1).numpy()
+
+
+def _reduced(frame: np.ndarray, widest: int | None) -> tuple[int, int]:
+    height, width = frame.shape[:2]
+    factor = 1 if widest is None else min(1, widest / width)
+    return round(width * factor), max(1, round(height * factor))
+
+
+def _resize(frame: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    height, width = frame.shape[:2]
+    if size == (width, height):
+        return frame
+    smaller = size[0] <= width and size[1] <= height
+    return cv2.resize(frame, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)

@@ -1,0 +1,123 @@
+"""A recording on its way to the Hugging Face hub: its card, its picture, and the tag by which LeRobot finds it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from tensordict import TensorDict
+
+from ..demonstrations import META, load_dataset, load_meta
+from .writing import FPS, quiet
+from dynmap_rl.envs.world import CONTROL_DT, EPISODE_STEPS
+from dynmap_rl.utils.hub import first_line
+
+PICTURE = "picture.png"
+FOLDERS = ["data/", "meta/", "videos/", "images/"]  # of a LeRobot dataset
+PAPER = "Visual Imitation Learning of Non-Prehensile Manipulation Tasks with Dynamics-Supervised Models"
+CITATION = f"""\
+@misc{{mustafa_dynamics_mapping,
+  title  = {{{PAPER}}},
+  author = {{Mustafa, Abdullah and Hanai, Ryo and Ramirez-Alpizar, Ixchel G. and Erich, Floris and
+            Nakajo, Ryoichi and Domae, Yukiyasu and Ogata, Tetsuya}},
+  url    = {{https://github.com/Automation-Research-Team/DynamicsMapping-2D}}
+}}"""
+DESCRIPTION = """\
+{kind} of the task `{task}` of dynmap_rl, for world models that are supervised on the dynamics of the scene:
+"{instruction}" A cart carries a free-standing block over a scene of 1 m x 1 m: {episodes} episodes of {steps} steps
+at {fps} Hz.
+
+![The first episodes, a row each]({picture})
+
+How it was made: PyMunk simulates, pygame draws, {maker}. The command was
+`python recipes/{command}`.
+
+| column | shape | content |
+|---|---|---|
+| `observation.images.front` | 64, 64, 3 | the frame, lossless |
+| `observation.state` | 5 | commanded cart pose x, y, theta (m, m, rad) and goal x, y (m) |
+| `action` | 3 | change of the commanded cart pose in one step (m, m, rad) |
+| `next.reward`, `next.done`, `next.success` | 1 | after the action |
+| `dynamics.position` | 6 | cart x, y, theta, block x, y, theta (m, m, rad) |
+| `dynamics.velocity` | 6 | its rate, as the simulator has it (m/s, rad/s) |
+| `dynamics.acceleration` | 6 | change of velocity since the last step over {dt} s (m/s^2, rad/s^2); 0 at the start |
+
+`{meta}` holds the splits ({splits}), constants for normalisation, and scene, seed and expert of every episode."""
+
+
+def push_dataset(root: str | Path, repo_id: str) -> None:
+    """Upload a recording to the Hugging Face hub; what is there already is not sent again, and the files of an earlier
+    recording that this one does not have are deleted there.
+
+    A card (what it is, columns with units, license, paper) and a picture go with it.
+
+    Raises:
+        ValueError: the folder is no recording of ours.
+        OSError: the hub refuses it or cannot be reached.
+    """
+    meta = load_meta(root)
+    with quiet():
+        from huggingface_hub import HfApi
+        from lerobot.datasets import LeRobotDataset
+
+        hub = {"repo_id": repo_id, "repo_type": "dataset"}
+        try:
+            dataset = LeRobotDataset(repo_id, root=root, video_backend="pyav")
+            draw_episodes(load_dataset(root, "train"), Path(root) / PICTURE)
+            HfApi().create_repo(**hub, exist_ok=True)
+            # LeRobot's own upload would leave stale files; after this one it has the card and the tag to add.
+            HfApi().upload_folder(
+                **hub, folder_path=root, ignore_patterns=["images/"], delete_patterns=FOLDERS
+            )
+            dataset.push_to_hub(
+                tags=["dynamics", "world-model", "imitation-learning"],
+                license="mit",
+                dataset_description=_describe(meta, instruction=dataset.meta.tasks.index[0]),
+                paper=PAPER,
+                url="https://github.com/Automation-Research-Team/DynamicsMapping-2D (the paper's)",
+                citation_bibtex=CITATION,
+            )
+        except Exception as error:  # of the hub's client, or of the HTTP library below it
+            reason = first_line(error)
+            raise OSError(
+                f"cannot push {root} to {repo_id} ({reason}); check the name, the network, and `hf auth login`"
+            ) from error
+
+
+def draw_episodes(episodes: TensorDict, path: Path, rows: int = 3, columns: int = 8, zoom: int = 2) -> None:
+    """Frames of the first episodes ``[E, T]``, evenly spaced in time, a row each."""
+    steps = np.linspace(0, episodes.shape[1] - 1, columns).round().astype(int)
+    frames = episodes["pixels"][:rows, steps].permute(0, 3, 1, 4, 2)  # row, y, column, x, RGB
+    picture = frames.flatten(2, 3).flatten(0, 1).numpy().repeat(zoom, 0).repeat(zoom, 1)
+    if not cv2.imwrite(str(path), picture[..., ::-1]):
+        raise OSError(f"{path} cannot be written")
+
+
+def _describe(meta: dict, instruction: str) -> str:
+    splits, task, kind = meta["splits"], meta["task"], meta["kind"]
+    train, test = (end - first for first, end in (splits["train"], splits["eval"]))
+    collect = f"collect.py --task {task} --kind {kind} --episodes {train} --eval_episodes {test}"
+    collect += f" --expert {meta['expert']}" if meta["expert"] != task else ""
+    maker, command = {
+        "demonstrations": (
+            "state-based PPO experts act; successful episodes, most with short pushes",
+            collect,
+        ),
+        "exploration": ("state-based PPO experts act, with noise and detours", collect),
+        "human": ("a person drives; successful episodes", f"play.py --task {task} --record FOLDER"),
+    }[kind]
+    return DESCRIPTION.format(
+        kind="Demonstrations of a person" if kind == "human" else kind.capitalize(),
+        task=task,
+        instruction=instruction,
+        episodes=len(meta["episodes"]),
+        steps=EPISODE_STEPS,
+        fps=FPS,
+        picture=PICTURE,
+        maker=maker,
+        command=command,
+        dt=CONTROL_DT,
+        meta=META,
+        splits=", ".join(f"{name} {first} to {end - 1}" for name, (first, end) in splits.items()),
+    )

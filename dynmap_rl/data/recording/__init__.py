@@ -1,0 +1,1 @@
+"""Recordings of experts and of persons, in shards that survive a kill."""

@@ -1,0 +1,149 @@
+"""Rollouts of the shipped experts: what a demonstration is, before it is written anywhere (paper, Sec. IV-C)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+
+from dynmap_rl.envs.scene import scene_seed
+from dynmap_rl.envs.tasks import BalanceReaching, get_task
+from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
+from dynmap_rl.envs.world import ACTION_LIMIT, EPISODE_STEPS, World
+from dynmap_rl.experts.network import list_checkpoints, load_expert
+
+KEYS = [
+    "pixels",
+    "agent_pos",
+    "goal",
+    "dynamics",
+    "action",
+    *(("next", k) for k in ("reward", "done", "is_success", "dropped", "position_error")),
+]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How one episode is made.
+
+    Attributes:
+        scene_seed: draws the scene.
+        checkpoint: the expert's checkpoint.
+        noise: standard deviation of the noise on the expert's acceleration, in units of its own exploration.
+        detours: goals other than the scene's that the expert is sent to first.
+        pushes: spans ``(start, end)`` of steps in which not the expert acts but a push towards a random velocity,
+            or to a stop, so that the demonstration shows how to recover. Imitation leaves these steps out.
+    """
+
+    scene_seed: int
+    checkpoint: str
+    noise: float = 0.0
+    detours: int = 0
+    pushes: tuple[tuple[int, int], ...] = ()
+
+
+def plan_demonstrations(
+    task: str, split: str, start: int, count: int, expert: str | Path | None = None
+) -> list[Plan]:
+    """Candidates ``start .. start + count`` of a split: the checkpoints in turn, two of three episodes with pushes."""
+    checkpoints = list_checkpoints(expert or task)
+    plans = []
+    for i in range(start, start + count):
+        seed = scene_seed(split, i)
+        pushes = _draw_pushes(seed, get_task(task).pushes) if i % 3 else ()
+        plans.append(Plan(seed, checkpoints[i % len(checkpoints)], pushes=pushes))
+    return plans
+
+
+def plan_exploration(
+    task: str, split: str, start: int, count: int, expert: str | Path | None = None
+) -> list[Plan]:
+    """Episodes that are no demonstrations: noisy experts that are sent to other places than the goal."""
+    checkpoints = list_checkpoints(expert or task)
+    return [
+        Plan(scene_seed(split, i), checkpoints[i % len(checkpoints)], noise=(0.5, 1.0, 2.0)[i % 3], detours=3)
+        for i in range(start, start + count)
+    ]
+
+
+def roll_out(task: str, plans: list[Plan], expert: str | Path | None = None) -> TensorDict:
+    """Run the plans as one batch.
+
+    Args:
+        task: name of the task.
+        plans: one an episode.
+        expert: whose checkpoints the plans name; by default the one that ships for the task.
+
+    Returns:
+        A TensorDict ``[E, 120]``: ``pixels``, ``agent_pos``, ``goal``, ``dynamics``, ``action`` as executed, and
+        under ``next`` ``reward``, ``done``, ``is_success``, ``dropped``, ``position_error``.
+    """
+    n = len(plans)
+    env = DynmapBatchedEnv(task, n, from_pixels=True)
+    td = env.reset(TensorDict({"scene_seed": torch.tensor([p.scene_seed for p in plans])}, [n]))
+    networks = {name: load_expert(expert or task, name) for name in sorted({p.checkpoint for p in plans})}
+    rngs = [np.random.default_rng([p.scene_seed, 1]) for p in plans]
+    detours = _detour_goals(plans, rngs)
+    steps = []
+    for t in range(EPISODE_STEPS):
+        state = td["state"].clone()
+        for row in np.flatnonzero(~np.isnan(detours[:, t, 0])):
+            state[row] = torch.from_numpy(_state_for(env.task, env.worlds[row], detours[row, t]))
+        acceleration = _expert_acceleration(state, plans, networks, rngs)
+        action = np.stack([w.action_for(a) for w, a in zip(env.worlds, acceleration, strict=True)])
+        _push(t, action, plans)
+        td = env.step(td.set("action", torch.from_numpy(action.astype(np.float32))))
+        executed = np.stack([w.action for w in env.worlds]).astype(np.float32)
+        td["action"] = torch.from_numpy(executed)
+        steps.append(td.select(*KEYS))
+        td = td["next"]
+    return torch.stack(steps, 1)
+
+
+def _state_for(task: BalanceReaching, world: World, goal: np.ndarray) -> np.ndarray:
+    """The state as if the goal were another."""
+    own, world.goal = world.goal, goal
+    state = task.state(world)
+    world.goal = own
+    return state
+
+
+def _expert_acceleration(state, plans, networks, rngs) -> np.ndarray:
+    # Row by row: on some CPUs the last bits of a product of matrices depend on the number of rows, and an episode is to
+    # be the same in any batch.
+    out = np.empty((len(plans), 3))
+    for row, plan in enumerate(plans):
+        mean, std = (values.numpy() for values in networks[plan.checkpoint](state[row]))
+        out[row] = mean + plan.noise * std * rngs[row].standard_normal(3)
+    return out
+
+
+def _push(t: int, action: np.ndarray, plans: list[Plan]) -> None:
+    """Put the pushes in the place of the actions; every other one brings the cart to a stop."""
+    for row, plan in enumerate(plans):
+        for number, (start, end) in enumerate(plan.pushes):
+            if start <= t < end:
+                rng = np.random.default_rng([plan.scene_seed, 3, number])
+                action[row] = rng.uniform(-ACTION_LIMIT, ACTION_LIMIT) * (number % 2)
+
+
+def _draw_pushes(scene_seed: int, number: int) -> tuple[tuple[int, int], ...]:
+    """So many pushes, most of them early, while the cart is on its way."""
+    rng = np.random.default_rng([scene_seed, 2])
+    starts = np.sort(rng.exponential(30, number).astype(int).clip(0, EPISODE_STEPS - 25))
+    return tuple((int(t), int(t + rng.integers(2, 7))) for t in starts)
+
+
+def _detour_goals(plans: list[Plan], rngs) -> np.ndarray:
+    """``[E, 120, 2]`` goals of the detours (m), each for 20 to 40 steps from the start; NaN afterwards."""
+    goals = np.full((len(plans), EPISODE_STEPS, 2), np.nan)
+    for row, (plan, rng) in enumerate(zip(plans, rngs, strict=True)):
+        t = 0
+        for _ in range(plan.detours):
+            end = t + int(rng.integers(20, 41))
+            goals[row, t:end] = rng.uniform((0.15, 0.08), (0.85, 0.75))
+            t = end
+    return goals

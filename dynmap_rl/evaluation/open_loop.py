@@ -1,0 +1,66 @@
+"""How far a world model's predictions carry without frames: its open-loop error over the horizon."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from tensordict import TensorDictBase
+
+from dynmap_rl.envs.imagination import ImaginationEnv, make_start
+from dynmap_rl.modules.world_model import WorldModel
+
+
+@torch.no_grad()
+def open_loop_errors(
+    world_model: WorldModel, episodes: TensorDictBase, context: int = 10, horizon: int = 40, batch: int = 50
+) -> dict:
+    """Predicted against simulated poses, with the demonstrations' actions and none of their later frames.
+
+    Args:
+        world_model: decodes positions.
+        episodes: held-out demonstrations ``[E, T]`` with ``pixels``, ``action`` and ``dynamics``.
+        context: frames that are seen first, at least 1.
+        horizon: steps that are predicted after the last of them.
+        batch: episodes at a time.
+
+    Returns:
+        ``model``, and ``still``, which is as if all stayed where it is in the last frame seen: for each
+        ``cart_mm``, ``block_mm`` (mean distance, mm) and ``cart_deg``, ``block_deg`` (mean absolute difference of
+        angles, degrees), lists of ``horizon`` numbers, 1 step ahead first. Beside them ``context`` and ``episodes``.
+
+    Raises:
+        ValueError: no positions are decoded, or the episodes are too short.
+    """
+    if "position" not in world_model.supervision:
+        raise ValueError("the world model is not supervised on position: there is nothing to compare")
+    if horizon < 1:
+        raise ValueError(f"a horizon is at least one step, not {horizon}")
+    if context < 1 or context + horizon > episodes.shape[1]:
+        steps = episodes.shape[1]
+        raise ValueError(f"{context} + {horizon} steps do not fit into episodes of {steps}")
+    device = next(world_model.parameters()).device
+    totals = {"model": 0.0, "still": 0.0}
+    for chunk in episodes.split(batch):
+        chunk = chunk[:, : context + horizon].to(device)
+        env = ImaginationEnv(world_model, make_start(world_model, chunk[:, :context]))
+        td, predicted = env.reset(), []
+        for t in range(context - 1, context + horizon - 1):
+            td = env.step(td.set("action", chunk["action"][:, t]))["next"]
+            predicted.append(td["predicted_dynamics", "position"])
+        position = chunk["dynamics", "position"]
+        truth, last = position[:, context:], position[:, context - 1 : context]
+        totals["model"] += _pose_errors(torch.stack(predicted, 1) - truth)
+        totals["still"] += _pose_errors(last - truth)
+    result = {"context": context, "episodes": len(episodes)}
+    for name, total in totals.items():
+        columns = (total / len(episodes)).cpu().T.tolist()
+        result[name] = dict(zip(("cart_mm", "cart_deg", "block_mm", "block_deg"), columns, strict=True))
+    return result
+
+
+def _pose_errors(difference: torch.Tensor) -> torch.Tensor:
+    """``[E, K, 6]`` (m, rad) to ``[K, 4]``, summed over episodes (mm, degrees; cart, then block)."""
+    parts = difference.unflatten(-1, (2, 3))  # (E, K, 2, 3)
+    distance, angle = parts[..., :2].norm(dim=-1) * 1000, parts[..., 2].abs() * 180 / math.pi
+    return torch.stack([distance, angle], -1).flatten(2).sum(0)

@@ -1,0 +1,233 @@
+"""The paper's figures of demonstrations (Fig. 2 to 4), of policy losses (Fig. 7) and of closed-loop episodes (Fig. 8).
+
+Those of a world model (Fig. 6 and 9) are in ``figures.py``.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+
+from dynmap_rl.envs.tasks import SUCCESS_DISTANCE
+from dynmap_rl.envs.world import CONTROL_DT
+from dynmap_rl.keys import DYNAMICS
+from dynmap_rl.modules.normalization import Normalizer
+from dynmap_rl.modules.supervision import row_name
+from dynmap_rl.reporting.figures import COMPONENTS, UNITS, moving_steps, plt, save_figure
+from dynmap_rl.runs.folder import read_metrics
+
+FRAMES = 8  # of a film strip
+
+
+def widest_ways(episodes: TensorDictBase, count: int) -> TensorDictBase:
+    """``count`` of the episodes ``[E, T]``: where nothing was pushed, and among those where the cart's way from start
+    to end spans most of x and of y."""
+    position = episodes["dynamics", "position"][..., :2]
+    area = (position.amax(1) - position.amin(1)).prod(-1)
+    pushed = episodes["disturbed"].flatten(1).any(1)
+    return episodes[(area - 1.0 * pushed).argsort(descending=True)[:count]]
+
+
+def plot_trajectory(episode: TensorDictBase, constants: dict, path: Path) -> None:
+    """A demonstration ``[T]`` over time (paper, Fig. 2): frames, the cart's action and the block's dynamics.
+
+    Args:
+        constants: of the dataset's normalisation; each panel's title gives the range that becomes [-1, 1].
+    """
+    figure = plt.figure(figsize=(10, 8.5), layout="constrained")
+    upper, lower = figure.subfigures(2, 1, height_ratios=[1, 5])
+    upper.suptitle("Balance-Reaching: a demonstration, normalised action and dynamics", fontsize=11)
+    _draw_strip(upper.subplots(1, FRAMES), episode)
+    axes = lower.subplots(4, 3, sharex=True, sharey=True)
+    time = np.arange(len(episode)) * CONTROL_DT
+    for row, quantity in enumerate(("action", *DYNAMICS)):
+        action = quantity == "action"
+        values = episode["action"] if action else episode["dynamics", quantity]
+        normal = Normalizer(**constants[quantity]).normalize(values)
+        units = UNITS["position" if action else quantity]
+        for column, component in enumerate(COMPONENTS):
+            axis, index = axes[row, column], column + (0 if action else 3)
+            axis.plot(time, normal[:, index], "tab:blue" if action else "tab:green", lw=1.2)
+            low, high = (constants[quantity][name][index] for name in ("low", "high"))
+            what = f"action $\\Delta${component}" if action else f"block {quantity} {component}"
+            axis.set_title(f"{what} ({low:.2g} to {high:.2g} {units[column]})", fontsize=8)
+            axis.tick_params(labelsize=7)
+            axis.grid(alpha=0.3)
+        axes[row, 0].set_ylabel("normalised", fontsize=8)
+    for axis in axes[-1]:
+        axis.set_xlabel("time [s]", fontsize=8)
+    save_figure(figure, path)
+
+
+def plot_film_strips(episodes: dict[str, TensorDictBase], path: Path) -> None:
+    """A demonstration ``[T]`` of each task as a strip of frames, from the start to where the block rests (paper,
+    Fig. 3)."""
+    figure = plt.figure(figsize=(1.3 * FRAMES, 1.8 * len(episodes)), layout="constrained")
+    rows = figure.subfigures(len(episodes), 1, squeeze=False).flat
+    for row, (title, episode) in zip(rows, episodes.items(), strict=True):
+        row.suptitle(title, fontsize=10)
+        _draw_strip(row.subplots(1, FRAMES), episode)
+    save_figure(figure, path)
+
+
+def _draw_strip(axes, episode: TensorDictBase) -> None:
+    for axis, t in zip(axes, moving_steps(episode, len(axes)), strict=True):
+        axis.imshow(episode["pixels"][t].permute(1, 2, 0).numpy())
+        axis.set(xticks=[], yticks=[])
+        axis.set_xlabel(f"{t * CONTROL_DT:.2f} s", fontsize=8)
+
+
+def plot_scenes(frames: torch.Tensor, path: Path, columns: int = 8, rows: int = 4) -> None:
+    """First frames uint8 ``[N, 3, 64, 64]`` of as many scenes as there are, in a grid (paper, Fig. 4)."""
+    frames = frames[: rows * columns].permute(0, 2, 3, 1).numpy()
+    rows = -(-len(frames) // columns)
+    figure, axes = plt.subplots(
+        rows, columns, figsize=(1.2 * columns, 1.2 * rows + 0.4), layout="constrained"
+    )
+    figure.suptitle(
+        "Start states, 1 m x 1 m each: positions, sizes and colours differ in every episode", fontsize=11
+    )
+    for axis in axes.flat:
+        axis.axis("off")
+    for axis, frame in zip(axes.flat, frames, strict=False):
+        axis.imshow(frame)
+    save_figure(figure, path)
+
+
+def read_losses(folders: list[Path], held_out: bool = True) -> tuple[np.ndarray, np.ndarray]:
+    """The policy losses of every seed of runs, at those optimiser steps that all of them have written down.
+
+    Args:
+        folders: of runs, with ``seed_N/metrics.jsonl``.
+        held_out: the plain L1 on held-out demonstrations; otherwise what training minimised (with its emphasis,
+            on one batch).
+
+    Returns:
+        The steps ``[S]`` and the losses ``[R, S]`` of R seeds in all (normalised units).
+    """
+    names = ("held_out_loss",) if held_out else ("loss", "loss_policy")  # decoupled, joint
+    curves = [
+        {row["step"]: row[name] for row in read_metrics(seed) for name in names if name in row}
+        for folder in folders
+        for seed in sorted(folder.glob("seed_*"))
+    ]
+    steps = sorted(set.intersection(*map(set, curves))) if curves else []
+    return np.array(steps), np.array([[curve[step] for step in steps] for curve in curves])
+
+
+def loss_panels(task: str) -> dict[str, dict[str, list[str]]]:
+    """The panels of Fig. 7: title to label to names of cells of recipes/tables.py.
+
+    But for the one thing that a panel compares, all of it is decoupled training of recurrent policies, over all
+    supervisions.
+    """
+    supervisions = [some for n in range(len(DYNAMICS) + 1) for some in combinations(DYNAMICS, n)]
+
+    def cells(training="decoupled", policy="recurrent", among=supervisions):
+        return [f"{task}_{training}_{'_'.join(s) or 'none'}_{policy}" for s in among]
+
+    end_to_end = [f"{task}_end_to_end_recurrent"]
+    panels = {
+        "(a) dynamics supervision": {row_name(s): cells(among=[s]) for s in supervisions},
+        "(b) training approach": {"decoupled": cells(), "joint": cells("joint"), "end-to-end": end_to_end},
+        "(c) policy type": {"recurrent": cells(), "feedforward": cells(policy="feedforward")},
+    }
+    for letter, quantity in zip("def", DYNAMICS, strict=True):
+        panels[f"({letter}) {quantity} prediction"] = {
+            f"with {quantity}": cells(among=[s for s in supervisions if quantity in s]),
+            f"without {quantity}": cells(among=[s for s in supervisions if quantity not in s]),
+        }
+    return panels
+
+
+def plot_losses(
+    panels: dict[str, dict[str, list[str]]], runs: Path, missing: list[str], path: Path, held_out: bool = True
+) -> None:
+    """Policy losses during training (paper, Fig. 7): in each panel a curve for each group of runs, the mean over
+    the seeds of all its runs, and, where there are few groups, one standard deviation.
+
+    Args:
+        panels: see :func:`loss_panels`.
+        runs: the folder that holds the runs of those names.
+        missing: those of them that are not done.
+        held_out: see :func:`read_losses`.
+    """
+    figure, axes = plt.subplots(3, 2, figsize=(11, 12), layout="constrained", sharey=True)
+    kind = "on held-out demonstrations (plain L1)" if held_out else "in training (one batch, with emphasis)"
+    figure.suptitle(f"Balance-Reaching, policy loss {kind}: mean and std over runs and seeds", fontsize=11)
+    axes[0, 0].set_yscale("log")
+    for axis, (title, groups) in zip(axes.flat, panels.items(), strict=True):
+        axis.set_title(title, fontsize=10)
+        for number, (label, names) in enumerate(groups.items()):
+            done = [runs / name for name in names if name not in missing]
+            steps, losses = read_losses(done, held_out)
+            if not len(steps):
+                axis.plot([], [], f"C{number}", label=f"{label}: not run")
+                continue
+            part = f" ({len(done)} of {len(names)} runs)" if len(done) < len(names) else ""
+            mean, deviation = losses.mean(0), losses.std(0)
+            axis.plot(steps, mean, f"C{number}", lw=1.3, marker=".", ms=3, label=label + part)
+            if len(groups) < 4:  # more bands hide each other
+                low, high = mean - deviation, mean + deviation
+                axis.fill_between(steps, low, high, color=f"C{number}", alpha=0.15, lw=0)
+        axis.set_xlabel("optimiser step", fontsize=8)
+        axis.set_ylabel("policy loss (normalised action)", fontsize=8)
+        axis.tick_params(which="both", labelsize=7, labelleft=True)
+        axis.yaxis.set_major_formatter("{x:g}")
+        axis.yaxis.set_minor_formatter("{x:g}")
+        axis.grid(which="both", alpha=0.3)
+        axis.legend(fontsize=7)
+        if not any(len(line.get_xdata()) for line in axis.lines):
+            _say_not_run(axis)
+    save_figure(figure, path)
+
+
+def plot_position_errors(panels: dict[str, TensorDictBase | None], path: Path) -> None:
+    """Position errors along closed-loop episodes (paper, Fig. 8): a panel for each policy.
+
+    Args:
+        panels: title to episodes ``[E, T]`` of :func:`dynmap_rl.evaluation.roll_out`; None where there is no run.
+    """
+    figure, axes = plt.subplots(
+        1, len(panels), figsize=(11, 4.2), layout="constrained", sharex=True, sharey=True
+    )
+    for axis, (title, episodes) in zip(axes, panels.items(), strict=True):
+        axis.set_title(title, fontsize=10)
+        axis.set_xlabel("time [s]", fontsize=9)
+        axis.set_ylabel("position error [mm]", fontsize=9)
+        axis.tick_params(labelsize=8, labelleft=True)
+        axis.grid(alpha=0.3)
+        if episodes is None:
+            _say_not_run(axis)
+        else:
+            draw_position_errors(axis, episodes)
+    save_figure(figure, path)
+
+
+def _say_not_run(axis) -> None:
+    axis.text(0.5, 0.5, "not run", transform=axis.transAxes, ha="center", va="center", fontsize=14)
+
+
+def draw_position_errors(axis, episodes: TensorDictBase) -> None:
+    """The cart's distance from the goal over time in every episode ``[E, T]``; red where the block was dropped in the
+    end, with a dot at that moment."""
+    position, dropped = episodes["dynamics", "position"], episodes["next", "dropped"].flatten(1)
+    error = 1000 * (position[..., :2] - episodes["goal"]).norm(dim=-1)  # [E, T]
+    time = np.arange(error.shape[1]) * CONTROL_DT
+    ends, labels = dropped[:, -1].tolist(), {False: "block stays", True: "block dropped"}
+    for end in (False, True):  # the dropped ones above the others
+        for i in (i for i, value in enumerate(ends) if value is end):
+            label = f"{labels.pop(end)} ({ends.count(end)})" if end in labels else None
+            axis.plot(time, error[i], "tab:red" if end else "tab:blue", lw=0.9, alpha=0.7, label=label)
+            if end:
+                t = min(
+                    int(dropped[i].int().argmax()) + 1, len(time) - 1
+                )  # the flag is that of the next state
+                axis.plot(time[t], error[i, t], "o", color="tab:red", ms=3)
+    axis.axhline(1000 * SUCCESS_DISTANCE, color="k", lw=1, ls="--", label="success: under 50 mm")
+    axis.set_ylim(bottom=0)
+    axis.legend(fontsize=8, loc="upper right")

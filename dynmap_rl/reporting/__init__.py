@@ -1,0 +1,1 @@
+"""Pages, figures and animations of runs and datasets."""

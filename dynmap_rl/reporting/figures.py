@@ -1,0 +1,187 @@
+"""Figures of a run: reconstruction, dynamics prediction (paper, Fig. 6 and 9), rollouts as an animation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+
+from dynmap_rl.envs.tasks import REST_SPEED
+from dynmap_rl.envs.world import CONTROL_DT
+from dynmap_rl.evaluation.probing import STATES
+from dynmap_rl.modules.actor import make_world_model_module
+from dynmap_rl.keys import DYNAMICS
+from dynmap_rl.modules.world_model import WorldModel
+
+matplotlib.use("Agg")
+
+COMPONENTS = ("x", "y", "theta")
+UNITS = {
+    "position": ("m", "m", "rad"),
+    "velocity": ("m/s", "m/s", "rad/s"),
+    "acceleration": ("m/s$^2$", "m/s$^2$", "rad/s$^2$"),
+}
+
+
+@torch.no_grad()
+def predict(world_model: WorldModel, episodes: TensorDictBase) -> TensorDictBase:
+    """The episodes ``[E, T]`` with the world model's one-step predictions."""
+    return make_world_model_module(world_model)(episodes.select("pixels", "action", "dynamics").clone(False))
+
+
+def plot_reconstruction(
+    world_model: WorldModel, episodes: TensorDictBase, path: Path, steps=(1, 8, 16, 24, 60, 110)
+) -> None:
+    """Held-out frames and their reconstructions from the frame before: one pair of rows an episode."""
+    steps = [t for t in steps if t < episodes.shape[1]]
+    figure = plt.figure(figsize=(1.3 * len(steps), 2.7 * len(episodes)))
+    draw_reconstruction(figure, predict(world_model, episodes), [steps] * len(episodes))
+    save_figure(figure, path)
+
+
+def plot_dynamics(world_model: WorldModel, episode: TensorDictBase, path: Path) -> None:
+    """The block's true and predicted dynamics along one held-out episode ``[T]``; nothing for an Only-RGB model."""
+    if not world_model.supervision:
+        return
+    figure = plt.figure(figsize=(9, 2.2 * len(world_model.supervision)))
+    draw_dynamics(figure, predict(world_model, episode[None])[0], world_model.supervision)
+    save_figure(figure, path)
+
+
+def plot_prediction(world_model: WorldModel, episodes: TensorDictBase, path: Path, title: str) -> None:
+    """Both in one picture (paper, Fig. 6 and 9): the frames of episodes ``[E, T]`` while the block moves, and the
+    dynamics of the first episode."""
+    rows, out = len(world_model.supervision), predict(world_model, episodes)
+    heights = [2.5 * len(episodes), 2.0 * rows]
+    figure = plt.figure(figsize=(10, 0.5 + sum(heights)), layout="constrained")
+    figure.suptitle(title)
+    upper, lower = figure.subfigures(2, 1, height_ratios=heights) if rows else (figure.subfigures(), None)
+    draw_reconstruction(upper, out, [moving_steps(episode, 8, first=1) for episode in out])
+    if lower:
+        draw_dynamics(lower, out[0], world_model.supervision)
+    save_figure(figure, path)
+
+
+def draw_reconstruction(figure, out: TensorDictBase, steps: list[list[int]]) -> None:
+    """Frames of episodes ``[E, T]`` (see :func:`predict`) and their reconstructions, at as many steps of each."""
+    axes = figure.subplots(2 * len(out), len(steps[0]), squeeze=False)
+    for row, episode in enumerate(out):
+        truth = episode["pixels"].permute(0, 2, 3, 1).numpy()
+        guess = episode["reconstruction", "pixels"].clamp(0, 1).permute(0, 2, 3, 1).float().numpy()
+        for column, t in enumerate(steps[row]):
+            axes[2 * row, column].imshow(truth[t])
+            axes[2 * row + 1, column].imshow(guess[t])
+            if row == 0 or steps[row] != steps[row - 1]:
+                axes[2 * row, column].set_title(f"{t * CONTROL_DT:.2f} s", fontsize=9)
+        axes[2 * row, 0].set_ylabel("true", fontsize=9)
+        axes[2 * row + 1, 0].set_ylabel("predicted", fontsize=9)
+    for axis in axes.flat:
+        axis.set(xticks=[], yticks=[])
+
+
+def draw_dynamics(figure, out: TensorDictBase, supervision: tuple[str, ...]) -> None:
+    """The block's dynamics along one episode ``[T]`` (see :func:`predict`): a row for each quantity."""
+    axes = figure.subplots(len(supervision), 3, squeeze=False, sharex=True)
+    time = np.arange(out.shape[0]) * CONTROL_DT
+    for row, quantity in enumerate(supervision):
+        for column, component in enumerate(COMPONENTS):
+            axis, index = axes[row, column], 3 + column
+            axis.plot(time, out["dynamics", quantity][:, index], "k", lw=1, label="true")
+            predicted = out["predicted_dynamics", quantity][1:, index]
+            axis.plot(time[1:], predicted, "tab:green", lw=1, label="predicted")
+            axis.set_title(f"block {quantity} {component} [{UNITS[quantity][column]}]", fontsize=8)
+            axis.tick_params(labelsize=7)
+    for axis in axes[-1]:
+        axis.set_xlabel("time [s]", fontsize=8)
+    axes[0, 0].legend(fontsize=7)
+
+
+def moving_steps(episode: TensorDictBase, count: int, first: int = 0) -> list[int]:
+    """``count`` steps of an episode ``[T]``, evenly spaced from ``first`` to the last in which the block moves."""
+    speed = episode["dynamics", "velocity"][:, 3:5].norm(dim=-1)
+    moving = (speed > REST_SPEED).nonzero().flatten().tolist()
+    last = min(max([first + count - 1, *moving[-1:]]), len(speed) - 1)
+    return np.linspace(first, last, count).round().astype(int).tolist()
+
+
+def plot_distributions(dynamics: dict[str, TensorDictBase], path: Path) -> dict[str, dict[str, list[float]]]:
+    """Histograms of the angles and angular velocities of cart and block, the tasks side by side.
+
+    Args:
+        dynamics: task name to ``position`` and ``velocity`` ``[E, T, 6]``.
+        path: of the picture.
+
+    Returns:
+        For each task and each histogram the 0.1, 50 and 99.9 % quantiles of the magnitude (rad, rad/s).
+    """
+    panels = {
+        f"{body} {name}": (quantity, index, unit)
+        for name, quantity, unit in (("angle", "position", "rad"), ("angular velocity", "velocity", "rad/s"))
+        for body, index in (("cart", 2), ("block", 5))
+    }
+    figure, axes = plt.subplots(len(dynamics), len(panels), figsize=(12, 2 * len(dynamics)), squeeze=False)
+    ranges: dict[str, dict[str, list[float]]] = {task: {} for task in dynamics}
+    for column, (title, (quantity, index, unit)) in enumerate(panels.items()):
+        values = {task: d[quantity][..., index].flatten().double().numpy() for task, d in dynamics.items()}
+        limit = max(np.abs(v).max() for v in values.values())
+        for row, (task, value) in enumerate(values.items()):
+            axis = axes[row, column]
+            axis.hist(value, bins=np.linspace(-limit, limit, 81), log=True, color="tab:green")
+            axis.set_title(f"{title} [{unit}]" if row == 0 else "", fontsize=8)
+            axis.set_ylabel(task if column == 0 else "", fontsize=8)
+            axis.tick_params(labelsize=6)
+            ranges[task][title] = np.quantile(np.abs(value), (0.001, 0.5, 0.999)).round(4).tolist()
+    save_figure(figure, path)
+    return ranges
+
+
+def save_figure(figure, path: Path) -> None:
+    """Write the picture and close the figure, laid out tightly where it has no layout of its own."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if figure.get_layout_engine() is None:
+        figure.tight_layout()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def plot_probes(probes: dict[str, dict], path: Path) -> None:
+    """R^2 of :func:`probe`, mean over the entries of a quantity: a panel a state, a row a world model by its name."""
+    figure, axes = plt.subplots(
+        1, len(STATES), figsize=(11, 1.5 + 0.4 * len(probes)), layout="constrained", sharey=True
+    )
+    figure.suptitle(
+        "How much of the dynamics a linear map of a state tells (R$^2$, held-out demonstrations)", fontsize=11
+    )
+    for axis, state in zip(axes, STATES, strict=True):
+        values = np.array([[np.mean(p[state][q]) for q in DYNAMICS] for p in probes.values()])
+        axis.imshow(values, vmin=0, vmax=1, cmap="Greens", aspect="auto")
+        axis.set_title(state, fontsize=10)
+        axis.set_xticks(range(len(DYNAMICS)), DYNAMICS, fontsize=9)
+        axis.set_yticks(range(len(probes)), probes, fontsize=9)
+        for (row, column), value in np.ndenumerate(values):
+            color = "w" if value > 0.6 else "k"
+            axis.text(column, row, f"{value:.2f}", ha="center", va="center", fontsize=8, color=color)
+    save_figure(figure, path)
+
+
+def plot_open_loop(errors: dict[str, dict], path: Path) -> None:
+    """Errors of :func:`open_loop_errors` over the horizon: a curve a world model, dotted where all stays as last seen."""
+    figure, axes = plt.subplots(2, 2, figsize=(10, 7), layout="constrained", sharex=True)
+    figure.suptitle("Open-loop prediction: actions are given, frames are not", fontsize=11)
+    for axis, key in zip(axes.T.flat, ("cart_mm", "cart_deg", "block_mm", "block_deg"), strict=True):
+        body, unit = key.split("_")
+        for number, (name, error) in enumerate(errors.items()):
+            time = [CONTROL_DT * (step + 1) for step in range(len(error["model"][key]))]
+            axis.plot(time, error["model"][key], f"C{number}", lw=1.3, label=name)
+        axis.plot(time, error["still"][key], "k:", lw=1, label="all stays where it was")
+        axis.set_ylabel(f"{body}, mean error [{unit}]", fontsize=9)
+        axis.grid(alpha=0.3)
+        axis.set_ylim(bottom=0)
+    for axis in axes[1]:
+        axis.set_xlabel("time since the last frame [s]", fontsize=9)
+    axes[0, 0].legend(fontsize=8)
+    save_figure(figure, path)

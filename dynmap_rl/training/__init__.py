@@ -1,0 +1,1 @@
+"""Training of world models, policies and experts: loops and their typed settings."""

@@ -1,0 +1,1 @@
+"""Helpers without knowledge of environments, models or data: files, processes, devices, weights, hub, command line."""

@@ -1,0 +1,57 @@
+"""The weights of modules as safetensors: files from strangers run no code, and take memory in
+proportion to their size."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save
+from torch import nn
+
+from .files import write_bytes
+
+
+def save_weights(path: Path, module: nn.Module) -> None:
+    """Write a module's state as safetensors, atomically."""
+    write_bytes(path, save({k: v.detach().cpu().contiguous() for k, v in module.state_dict().items()}))
+
+
+def load_module[Module: nn.Module](path: Path, make: Callable[[], Module]) -> Module:
+    """What ``make`` makes, with the weights of a safetensors file.
+
+    Nothing is allocated before it is known that the file has the module's names and shapes: how large a module is
+    may be said by a file from elsewhere.
+
+    Raises:
+        ValueError: the file is missing, damaged, or does not fit the module.
+    """
+    if not Path(path).exists():
+        raise ValueError(f"no weights at {path}")
+    try:
+        with torch.device("meta"):
+            shapes = {name: list(value.shape) for name, value in make().state_dict().items()}
+        with safe_open(path, "pt") as file:
+            found = {name: file.get_slice(name).get_shape() for name in file.keys()}
+        if found != shapes:
+            differing = sorted(k for k in {*found, *shapes} if found.get(k) != shapes.get(k))
+            raise ValueError(f"other names or shapes, such as {differing[0]}")
+        module = make()
+        module.load_state_dict(load_file(path))
+    except OSError:
+        raise
+    except Exception as error:  # of torch for impossible sizes, of safetensors for damaged files
+        raise ValueError(f"{path} does not hold this model's weights: {error}") from error
+    return module
+
+
+def fingerprint(module: nn.Module) -> str:
+    """SHA-256 over all weights and buffers: equal before and after means that nothing has changed."""
+    digest = hashlib.sha256()
+    for name, value in sorted(module.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(value.cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
