@@ -1,23 +1,25 @@
 """Record expert demonstrations as a LeRobot dataset (paper, Sec. IV-C).
 
     python recipes/collect.py                                  # 300 + 50 demonstrations of task 1
-    python recipes/collect.py --kind exploration               # other places than the goal, noise, drops
+    python recipes/collect.py --kind exploration               # detours, noise and drops
     python recipes/collect.py --push_to_hub user/name
 
-The experts ship with the package. The same command goes on where it was stopped, or says that it is done. A page in
-runs/collect, `report.html`, shows what was recorded.
+The experts ship with the package. The same command resumes a stopped recording. The page report.html in runs/collect
+shows what was recorded.
 """
 
-import dataclasses
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynmap_rl.utils.cli import run_recipe
+from dynmap_rl.utils.cli import command_line, run_recipe
 
 
-@dataclass
+@dataclass(frozen=True)
 class Config:
-    # Name of the task: balance_reaching, balance_reaching_obstacle, bin_dropping, or module:Class of your own.
+    """Settings of the recipe."""
+
+    # Task: balance_reaching, balance_reaching_obstacle, bin_dropping, or module:Class of your own.
     task: str = "balance_reaching"
     # demonstrations (successful episodes only) or exploration (noisy experts on detours, all episodes).
     kind: str = "demonstrations"
@@ -36,23 +38,26 @@ class Config:
 
 
 def main(config: Config) -> None:
+    """Record, report and upload."""
     from dynmap_rl.data.demonstrations import META
     from dynmap_rl.data.format.hub import push_dataset
     from dynmap_rl.data.recording.shards import record_dataset
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.reporting.dataset_page import write_dataset_page
+    from dynmap_rl.runs.folder import plain_settings
 
     suffix = "" if config.kind == "demonstrations" else f"_{config.kind}"
     output = config.output or Path("datasets") / f"{get_task(config.task).name}{suffix}"
     complete = (output / META).exists()
     sizes = config.episodes, config.eval_episodes
     record_dataset(output, config.task, config.kind, *sizes, config.workers, config.expert)
-    print(f"{'complete already' if complete else 'done'}: {output}")
-    write_dataset_page(Path("runs/collect") / output.name, output, dataclasses.asdict(config))
+    print(f"{'already complete' if complete else 'written'}: {output}")
+    folder = Path("runs/collect") / output.name
+    write_dataset_page(folder, output, plain_settings(config), command_line(sys.argv))
     if config.push_to_hub:
         push_dataset(output, config.push_to_hub)
         print(f"pushed: {config.push_to_hub}")
 
 
 if __name__ == "__main__":
-    run_recipe(main, Config)
+    run_recipe(main, Config, sys.argv)

@@ -1,154 +1,122 @@
-"""Decoupled training (paper, Sec. III-B): pretrain a world model, freeze it, train policies on its states, evaluate.
+"""Decoupled training (paper, Sec. III-B): train a world model, freeze it, train policies on its states, evaluate.
 
     python recipes/decoupled.py                                       # RGB+[P+V], recurrent policy
-    python recipes/decoupled.py --supervision none --policy feedforward
+    python recipes/decoupled.py --world_model.supervision none --policy.kind feedforward
     python recipes/decoupled.py --task bin_dropping
-    python recipes/decoupled.py --task none --dataset datasets/mine   # a robot's dataset with dynamics columns
 
-With no option it records the demonstrations with the shipped expert first. The same command on the same run folder
-goes on where it was stopped, or says that it is done.
+Demonstrations are recorded with the shipped expert where they are missing. The same command resumes a stopped run, and
+prints the result of a finished one.
 """
 
-from dataclasses import dataclass
+import sys
+from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 
-from dynmap_rl.utils.cli import refuse
-from dynmap_rl.utils.cli import replace_defaults
-from dynmap_rl.utils.cli import run_recipe
+from dynmap_rl.evaluation.settings import Evaluation
+
+from dynmap_rl.training.settings import PolicyTraining, WorldModelTraining
+from dynmap_rl.utils.cli import command_line, parse_seeds, refuse, run_recipe
+from dynmap_rl.utils.devices import Compute
 
 
-@dataclass
+@dataclass(frozen=True)
 class Config:
-    # Name of the task: balance_reaching, balance_reaching_obstacle, bin_dropping, module:Class of your own, or
-    # none for a LeRobot dataset of any other task (--dataset; see README, "Your own robot's dataset").
+    """Settings of the recipe."""
+
+    # Task: balance_reaching, balance_reaching_obstacle, bin_dropping, or module:Class of your own.
     task: str = "balance_reaching"
-    # Which dynamics the world model is supervised on: any of position,velocity,acceleration, or none (Only-RGB).
-    supervision: str = "position,velocity"
-    # Policy: feedforward or recurrent.
-    policy: str = "recurrent"
+    # Dataset: a folder or a hub id; by default datasets/TASK, recorded where it is missing.
+    dataset: str | None = None
+    # Run folder; by default runs/decoupled/TASK/SUPERVISION_KIND.
+    run: Path | None = None
     # Seeds of the policies.
     seeds: str = "0,1,2"
-    # Seed of the world model.
-    world_model_seed: int = 0
-    # Dataset: a folder or a hub id; by default datasets/TASK, recorded if it is not there.
-    dataset: str | None = None
-    # With --task none: the camera's column; by default the first.
-    camera: str | None = None
-    # With --task none: the goal's column and entries, such as observation.state:3,4; by default no goal.
-    goal: str | None = None
-    # Run folder; by default runs/decoupled/TASK/SUPERVISION_POLICY.
-    run: Path | None = None
-    # Run folder whose world model is taken, its id on the hub, or balance_reaching, which ships with the package: of the
-    # same task and supervision. By default one is trained here.
-    world_model: Path | None = None
-    # Optimiser steps of the world model.
-    updates: int = 2500
-    # Windows a step.
-    windows: int = 16
-    # Time steps a window.
-    window_steps: int = 24
-    # Frames decoded a window, drawn at random.
-    rgb_steps: int = 8
-    # Peak learning rate of the world model (100 steps of warm-up, then a cosine).
-    learning_rate: float = 2e-3
-    # Weight of the latent's loss (Eq. 4a).
-    beta_z: float = 0.1
-    # Weight of the loss of every supervised quantity (Eq. 5).
-    beta_dynamics: float = 1.0
-    # Bars painted on the background of a window, at most (see dynmap_rl.data.augmentation.add_distractors); 0 for none.
-    distractors: int = 3
-    # Spatial-softmax keypoints beside the plain CNN's features (beyond the paper).
-    keypoints: bool = False
-    # Optimiser steps of a policy.
-    policy_updates: int = 2500
-    # Episodes a step.
-    policy_batch: int = 32
-    # Recoloured copies of every demonstration, beside it.
-    copies: int = 2
-    # Peak learning rate of a policy (100 steps of warm-up, then a cosine).
-    policy_learning_rate: float = 3e-3
-    # Weight of the steps in which the expert changes its action (see imitation_loss); 0 for the paper's plain L1.
-    emphasis: float = 60.0
-    # Scenes to evaluate on: those of test, or of validation while you choose settings.
-    split: str = "test"
-    # Scenes of the paper's protocol.
-    paper_episodes: int = 50
-    # Scenes that all policies of the tables share, 1,000 at most.
-    test_episodes: int = 1000
-    # Every stage in a minimal size, for tests.
-    smoke: bool = False
-    # cpu, cuda, or auto: the GPU where there is one.
-    device: str = "auto"
-    # Cores: threads of the world model's training, then policies trained at a time.
-    threads: int = 2
-    # Metrics to tensorboard, wandb or trackio as well, where it is installed.
+    # Run whose world model is used instead of training one: a folder, a hub id, or balance_reaching (shipped).
+    pretrained: str | None = None
+    # World model.
+    world_model: WorldModelTraining = WorldModelTraining()
+    # Policies.
+    policy: PolicyTraining = PolicyTraining()
+    # Evaluation in closed loop.
+    eval: Evaluation = Evaluation()
+    # Device and cores.
+    compute: Compute = Compute()
+    # Logger beside metrics.jsonl: tensorboard, wandb or trackio.
     logger: str | None = None
 
 
-WORLD_MODEL = (  # what says nothing where the world model is there
-    "world_model_seed", "updates", "windows", "window_steps", "rgb_steps", "learning_rate", "beta_z", "beta_dynamics",
-    "distractors", "keypoints",
-)  # fmt: skip
-SMOKE = {
-    "updates": 4, "windows": 2, "window_steps": 6, "rgb_steps": 2, "policy_updates": 3, "policy_batch": 2,
-    "copies": 1, "paper_episodes": 2, "test_episodes": 3, "seeds": "0",
-}  # fmt: skip
-
-
 def main(config: Config) -> None:
+    """Train, evaluate and report."""
     import torch
 
-    from dynmap_rl import frozen  # MODULE
-    from dynmap_rl import modules  # MODULE
-    from dynmap_rl import runs  # MODULE
-    from dynmap_rl import settings  # MODULE
-    from dynmap_rl.envs.tasks import NO_TASK
-    from dynmap_rl.modules.supervision import parse_supervision
-    from dynmap_rl.reporting.run_page import print_row
-    from dynmap_rl.reporting.run_page import write_report
-    from dynmap_rl.training.world_model import train_world_model
+    from dynmap_rl.data.demonstrations import load_demonstrations
+    from dynmap_rl.envs.tasks import get_task
+    from dynmap_rl.evaluation.protocol import judge_in_closed_loop
+    from dynmap_rl.paper.published import paper_numbers
+    from dynmap_rl.reporting.run_page import row_text, write_report
+    from dynmap_rl.runs.folder import open_run, plain_settings
+    from dynmap_rl.runs.loggers import check_logger
+    from dynmap_rl.training.dataset import check_dataset, find_or_record
+    from dynmap_rl.training.decoupled import check_same, train_policies
+    from dynmap_rl.training.world_model import build_world_model, train_world_model
+    from dynmap_rl.utils.devices import choose_device, seed_everything
+    from dynmap_rl.utils.files import read_json
 
-    if config.world_model:
-        refuse(config, WORLD_MODEL, "is of a world model's training, and that of --world_model is done")
-    if config.smoke:
-        replace_defaults(config, SMOKE)
-    if config.task == NO_TASK:
-        replace_defaults(config, settings.FOREIGN)
-    supervision = parse_supervision(config.supervision)
-    seeds = settings.check_settings(config)
-    trained = None
-    if config.world_model:
-        trained, source = frozen.load_source(config.world_model)
-        if source != settings.describe_source(config, "decoupled") or trained.supervision != supervision:
-            raise ValueError(
-                f"{config.world_model} is a world model of {source.get('dataset', source['task'])}, {source['training']}, supervised on "
-                f"{trained.supervision}; for another task use recipes/generalize.py"
-            )
-    name = f"{'_'.join(supervision) or 'none'}_{config.policy}{'_smoke' if config.smoke else ''}"
-    folder = config.run or Path("runs/decoupled") / settings.name_task(config) / name
-    folder = runs.open_run(folder, config, ignore=("run", "threads", "device", "logger"))
+    task, seeds = get_task(config.task), parse_seeds(config.seeds)
+    device = choose_device(config.compute.device)
+    check_logger(config.logger)
+    if config.dataset:
+        check_dataset(config.dataset, config.task)
+    world_model = load_pretrained(config) if config.pretrained else None
+    source = {"task": config.task, "training": "decoupled"}
+    name = f"{config.world_model.supervision.replace(',', '_')}_{config.policy.kind}"
+    folder = config.run or Path("runs/decoupled") / task.name / name
+    open_run(folder, config, ignore=("run", "compute", "logger"))
     if (folder / "eval.json").exists():
-        result = runs.read_json(folder / "eval.json")
-        if trained:
-            frozen.check_same(trained, result, folder)
-        print(f"{folder} is done; delete it to run again")
-        return print_row(result)
-    torch.set_num_threads(config.threads)
+        result = read_json(folder / "eval.json")
+        if world_model:
+            check_same(world_model, result, folder)
+        print(f"{folder} is complete; delete it to run again\n\n{row_text(result, paper_numbers(result))}")
+        return
 
-    dataset = settings.find_or_record(config)
-    episodes, constants = settings.load_episodes(config, dataset)
-
-    world_model = trained
+    torch.set_num_threads(config.compute.threads)
+    dataset = find_or_record(config.task, config.dataset)
+    episodes, constants = load_demonstrations(dataset)
     if world_model is None:
-        runs.seed_everything(config.world_model_seed)
-        world_model = modules.make_world_model(constants, supervision, keypoints=config.keypoints)
-        world_model.to(runs.choose_device(config.device))
-        train_world_model(world_model, episodes, folder, config)
-    fingerprint = frozen.train_policies(world_model, episodes, constants, folder, config, seeds)
-    result = write_report(folder, config, dataset, world_model, episodes["eval"], seeds, fingerprint)
-    print_row(result)
-    print(f"eval.json and all else is in {folder}")
+        seed_everything(config.world_model.seed)
+        world_model = build_world_model(constants, config.world_model).to(device)
+        train_world_model(world_model, episodes, folder, config.world_model, logger=config.logger)
+    judge = partial(judge_in_closed_loop, task=config.task, settings=config.eval)
+    fingerprint = train_policies(
+        world_model, episodes, constants, folder, config.policy,
+        judge=judge, seeds=seeds, compute=config.compute, logger=config.logger,
+    )  # fmt: skip
+    result = write_report(
+        folder, world_model, episodes["eval"], seeds,
+        task=config.task, dataset=dataset, policy=config.policy.kind, source=source,
+        settings=plain_settings(config), command=command_line(sys.argv), frozen=fingerprint, compare=paper_numbers,
+    )  # fmt: skip
+    print(f"\n{row_text(result, paper_numbers(result))}\nwritten: {folder}")
+
+
+def load_pretrained(config: Config):
+    """Load the world model of another run of the same task and supervision."""
+    from dynmap_rl.modules.supervision import parse_supervision
+    from dynmap_rl.runs.lookup import load_source
+
+    names = [field.name for field in fields(WorldModelTraining) if field.name != "supervision"]
+    refuse(config.world_model, WorldModelTraining(), names, "--pretrained", "world_model.")
+    world_model, source = load_source(config.pretrained)
+    expected = {"task": config.task, "training": "decoupled"}
+    if source != expected or world_model.supervision != parse_supervision(config.world_model.supervision):
+        raise ValueError(
+            f"--pretrained must be a decoupled world model of {config.task} with --world_model.supervision "
+            f"{config.world_model.supervision}, got {source} with {world_model.supervision}; for another task use "
+            "recipes/generalize.py"
+        )
+    return world_model
 
 
 if __name__ == "__main__":
-    run_recipe(main, Config)
+    run_recipe(main, Config, sys.argv)

@@ -1,95 +1,93 @@
 """End-to-end training (paper, Sec. III-B, Eq. 3): the policy's loss alone, through encoder and transition; evaluate.
 
     python recipes/end_to_end.py
-    python recipes/end_to_end.py --policy feedforward
+    python recipes/end_to_end.py --policy.kind feedforward
 
-Every seed has a world model of its own; recipes/generalize.py takes that of the first. With no option it records the
-demonstrations with the shipped expert first. The same command on the same run folder goes on where it was stopped, or
-says that it is done.
+Every seed has a world model of its own; recipes/generalize.py takes the first seed's. Demonstrations are recorded with
+the shipped expert where they are missing. The same command resumes a stopped run, and prints the result of a finished
+one.
 """
 
-from dataclasses import dataclass
+import sys
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
-from dynmap_rl.utils.cli import replace_defaults
-from dynmap_rl.utils.cli import run_recipe
+from dynmap_rl.evaluation.settings import Evaluation
+
+from dynmap_rl.training.settings import EndToEndTraining, PolicyArchitecture, WorldModelArchitecture
+from dynmap_rl.utils.cli import command_line, parse_seeds, run_recipe
+from dynmap_rl.utils.devices import Compute
 
 
-@dataclass
+@dataclass(frozen=True)
 class Config:
-    # Name of the task: balance_reaching, balance_reaching_obstacle, bin_dropping, or module:Class of your own.
+    """Settings of the recipe."""
+
+    # Task: balance_reaching, balance_reaching_obstacle, bin_dropping, or module:Class of your own.
     task: str = "balance_reaching"
-    # Policy: feedforward or recurrent.
-    policy: str = "recurrent"
-    # Seeds of world model and policy.
-    seeds: str = "0,1,2"
-    # Dataset: a folder or a hub id; by default datasets/TASK, recorded if it is not there.
+    # Dataset: a folder or a hub id; by default datasets/TASK, recorded where it is missing.
     dataset: str | None = None
-    # Run folder; by default runs/end_to_end/TASK/POLICY.
+    # Run folder; by default runs/end_to_end/TASK/KIND.
     run: Path | None = None
-    # Optimiser steps.
-    updates: int = 2500
-    # Windows a step.
-    windows: int = 8
-    # Time steps a window.
-    window_steps: int = 48
-    # Peak learning rate (100 steps of warm-up, then a cosine).
-    learning_rate: float = 2e-3
-    # Weight of the steps in which the expert changes its action (see imitation_loss); 0 for the paper's plain L1.
-    emphasis: float = 60.0
-    # Bars painted on the background of a window, at most (see dynmap_rl.data.augmentation.add_distractors); 0 for none.
-    distractors: int = 3
-    # Scenes to evaluate on: those of test, or of validation while you choose settings.
-    split: str = "test"
-    # Scenes of the paper's protocol.
-    paper_episodes: int = 50
-    # Scenes that all policies of the tables share, 1,000 at most.
-    test_episodes: int = 1000
-    # Every stage in a minimal size, for tests.
-    smoke: bool = False
-    # cpu, cuda, or auto: the GPU where there is one.
-    device: str = "auto"
-    # Seeds trained at a time, each on one core.
-    threads: int = 2
-    # Metrics to tensorboard, wandb or trackio as well, where it is installed.
+    # Seeds of world models and policies.
+    seeds: str = "0,1,2"
+    # Policy.
+    policy: PolicyArchitecture = PolicyArchitecture()
+    # Training of both.
+    training: EndToEndTraining = EndToEndTraining()
+    # Evaluation in closed loop.
+    eval: Evaluation = Evaluation()
+    # Device and cores.
+    compute: Compute = Compute()
+    # Logger beside metrics.jsonl: tensorboard, wandb or trackio.
     logger: str | None = None
 
 
-SMOKE = {
-    "updates": 4, "windows": 2, "window_steps": 6, "paper_episodes": 2, "test_episodes": 3, "seeds": "0",
-}  # fmt: skip
-
-
 def main(config: Config) -> None:
-    from dynmap_rl import data  # MODULE
-    from dynmap_rl import joint  # MODULE
-    from dynmap_rl import modules  # MODULE
-    from dynmap_rl import runs  # MODULE
-    from dynmap_rl import settings  # MODULE
+    """Train, evaluate and report."""
+    from dynmap_rl.data.demonstrations import load_dataset, load_demonstrations
     from dynmap_rl.envs.tasks import get_task
-    from dynmap_rl.reporting.run_page import print_row
-    from dynmap_rl.reporting.run_page import write_report
+    from dynmap_rl.evaluation.protocol import judge_in_closed_loop
+    from dynmap_rl.paper.published import paper_numbers
+    from dynmap_rl.reporting.run_page import row_text, write_report
+    from dynmap_rl.runs.folder import open_run, plain_settings
+    from dynmap_rl.runs.loggers import check_logger
+    from dynmap_rl.training.dataset import check_dataset, find_or_record
+    from dynmap_rl.training.joint import train_seeds
+    from dynmap_rl.utils.devices import choose_device
+    from dynmap_rl.utils.files import read_json
 
-    if config.smoke:
-        replace_defaults(config, SMOKE)
-    seeds = settings.check_settings(config)
-    name = f"{config.policy}{'_smoke' if config.smoke else ''}"
-    folder = config.run or Path("runs/end_to_end") / get_task(config.task).name / name
-    folder = runs.open_run(folder, config, ignore=("run", "threads", "device", "logger"))
+    task, seeds = get_task(config.task), parse_seeds(config.seeds)
+    choose_device(config.compute.device)
+    check_logger(config.logger)
+    if config.dataset:
+        check_dataset(config.dataset, config.task)
+    folder = config.run or Path("runs/end_to_end") / task.name / config.policy.kind
+    open_run(folder, config, ignore=("run", "compute", "logger"))
     if (folder / "eval.json").exists():
-        print(f"{folder} is done; delete it to run again")
-        return print_row(runs.read_json(folder / "eval.json"))
+        result = read_json(folder / "eval.json")
+        print(f"{folder} is complete; delete it to run again\n\n{row_text(result, paper_numbers(result))}")
+        return
 
-    dataset = settings.find_or_record(config)
-    joint.train_seeds(dataset, (), folder, config, seeds, end_to_end=True)
-    world_model = modules.load_world_model(folder / f"seed_{seeds[0]}" / "world_model")
-    modules.save_world_model(folder / "world_model", world_model)
-    source = {"task": config.task, "training": "end_to_end"}
-    held_out = data.load_dataset(dataset, "eval")
-    result = write_report(folder, config, dataset, world_model, held_out, seeds, source=source)
-    print_row(result)
-    print(f"eval.json and all else is in {folder}")
+    dataset = find_or_record(config.task, config.dataset)
+    augmentation = config.training.augmentation
+    if not task.symmetric:  # the policy learns from the changed windows too
+        augmentation = replace(augmentation, mirror=False, max_shift=0)
+    world_model = train_seeds(
+        partial(load_demonstrations, dataset), folder,
+        WorldModelArchitecture("none"), config.policy, replace(config.training, augmentation=augmentation),
+        judge=partial(judge_in_closed_loop, task=config.task, settings=config.eval),
+        seeds=seeds, compute=config.compute, logger=config.logger,
+    )  # fmt: skip
+    result = write_report(
+        folder, world_model, load_dataset(dataset, "eval"), seeds,
+        task=config.task, dataset=dataset, policy=config.policy.kind,
+        source={"task": config.task, "training": "end_to_end"},
+        settings=plain_settings(config), command=command_line(sys.argv), compare=paper_numbers,
+    )  # fmt: skip
+    print(f"\n{row_text(result, paper_numbers(result))}\nwritten: {folder}")
 
 
 if __name__ == "__main__":
-    run_recipe(main, Config)
+    run_recipe(main, Config, sys.argv)

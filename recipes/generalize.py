@@ -2,98 +2,100 @@
 
     python recipes/decoupled.py                                  # trains the world model of task 1
     python recipes/generalize.py --task balance_reaching_obstacle
-    python recipes/generalize.py --task bin_dropping --world_model runs/decoupled/balance_reaching/none_recurrent
+    python recipes/generalize.py --task bin_dropping --pretrained runs/decoupled/balance_reaching/none_recurrent
 
-Compares with the paper's Tables II and III. The same command on the same run folder goes on where it was stopped,
-or says that it is done.
+Demonstrations are recorded with the shipped expert where they are missing. The same command resumes a stopped run, and
+prints the result of a finished one.
 """
 
+import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-from dynmap_rl.utils.cli import replace_defaults
-from dynmap_rl.utils.cli import run_recipe
+from dynmap_rl.evaluation.settings import Evaluation
+
+from dynmap_rl.training.settings import PolicyTraining
+from dynmap_rl.utils.cli import command_line, parse_seeds, run_recipe
+from dynmap_rl.utils.devices import Compute
 
 
-@dataclass
+@dataclass(frozen=True)
 class Config:
-    # Name of the task to learn: balance_reaching_obstacle, bin_dropping, or module:Class of your own.
+    """Settings of the recipe."""
+
+    # Task to learn: balance_reaching_obstacle, bin_dropping, or module:Class of your own.
     task: str = "balance_reaching_obstacle"
-    # Run folder that a world model was trained in, its id on the hub, or balance_reaching, which ships with the package.
-    world_model: Path = Path("runs/decoupled/balance_reaching/position_velocity_recurrent")
-    # Policy: feedforward or recurrent.
-    policy: str = "recurrent"
+    # Run whose world model is used: a folder, a hub id, or balance_reaching (shipped).
+    pretrained: str = "runs/decoupled/balance_reaching/position_velocity_recurrent"
+    # Dataset: a folder or a hub id; by default datasets/TASK, recorded where it is missing.
+    dataset: str | None = None
+    # Run folder; by default runs/generalize/TASK/TRAINING_SUPERVISION_KIND.
+    run: Path | None = None
     # Seeds of the policies.
     seeds: str = "0,1,2"
-    # Dataset: a folder or a hub id; by default datasets/TASK, recorded if it is not there.
-    dataset: str | None = None
-    # Run folder; by default runs/generalize/TASK/TRAINING_SUPERVISION_POLICY.
-    run: Path | None = None
-    # Optimiser steps of a policy.
-    policy_updates: int = 2500
-    # Episodes a step.
-    policy_batch: int = 32
-    # Recoloured copies of every demonstration, beside it.
-    copies: int = 2
-    # Peak learning rate of a policy (100 steps of warm-up, then a cosine).
-    policy_learning_rate: float = 3e-3
-    # Weight of the steps in which the expert changes its action (see imitation_loss); 0 for the paper's plain L1.
-    emphasis: float = 60.0
-    # Scenes to evaluate on: those of test, or of validation while you choose settings.
-    split: str = "test"
-    # Scenes of the paper's protocol.
-    paper_episodes: int = 50
-    # Scenes that all policies of the tables share, 1,000 at most.
-    test_episodes: int = 1000
-    # Every stage in a minimal size, for tests.
-    smoke: bool = False
-    # cpu, cuda, or auto: the GPU where there is one.
-    device: str = "auto"
-    # Policies trained at a time, each on one core.
-    threads: int = 2
-    # Metrics to tensorboard, wandb or trackio as well, where it is installed.
+    # Policies.
+    policy: PolicyTraining = PolicyTraining()
+    # Evaluation in closed loop.
+    eval: Evaluation = Evaluation()
+    # Device and cores.
+    compute: Compute = Compute()
+    # Logger beside metrics.jsonl: tensorboard, wandb or trackio.
     logger: str | None = None
 
 
-SMOKE = {
-    "policy_updates": 3, "policy_batch": 2, "copies": 1, "paper_episodes": 2, "test_episodes": 3, "seeds": "0",
-}  # fmt: skip
-
-
 def main(config: Config) -> None:
+    """Train, evaluate and report."""
     import torch
 
-    from dynmap_rl import frozen  # MODULE
-    from dynmap_rl import runs  # MODULE
-    from dynmap_rl import settings  # MODULE
+    from dynmap_rl.data.demonstrations import load_demonstrations
     from dynmap_rl.envs.tasks import get_task
-    from dynmap_rl.reporting.run_page import print_row
-    from dynmap_rl.reporting.run_page import write_report
+    from dynmap_rl.evaluation.protocol import judge_in_closed_loop
+    from dynmap_rl.paper.published import paper_numbers
+    from dynmap_rl.reporting.run_page import row_text, write_report
+    from dynmap_rl.runs.folder import open_run, plain_settings
+    from dynmap_rl.runs.loggers import check_logger
+    from dynmap_rl.runs.lookup import load_source
+    from dynmap_rl.training.dataset import check_dataset, find_or_record
+    from dynmap_rl.training.decoupled import check_same, train_policies
+    from dynmap_rl.utils.devices import choose_device
+    from dynmap_rl.utils.files import read_json
 
-    if config.smoke:
-        replace_defaults(config, SMOKE)
-    seeds = settings.check_settings(config)
-    world_model, source = frozen.load_source(config.world_model)
-    if source["task"] == config.task:
-        raise ValueError(f"{config.world_model} was trained on {config.task} itself; choose another --task")
-    name = f"{source['training']}_{'_'.join(world_model.supervision) or 'none'}_{config.policy}"
-    name += "_smoke" if config.smoke else ""
-    folder = config.run or Path("runs/generalize") / get_task(config.task).name / name
-    folder = runs.open_run(folder, config, ignore=("run", "threads", "device", "logger"))
+    task, seeds = get_task(config.task), parse_seeds(config.seeds)
+    choose_device(config.compute.device)
+    check_logger(config.logger)
+    if config.dataset:
+        check_dataset(config.dataset, config.task)
+    world_model, source = load_source(config.pretrained)
+    if source.get("task") == config.task:
+        raise ValueError(
+            f"--task must differ from the task of --pretrained, got {config.task} for both; choose another --task, or "
+            "use recipes/decoupled.py"
+        )
+    name = f"{source['training']}_{'_'.join(world_model.supervision) or 'none'}_{config.policy.kind}"
+    folder = config.run or Path("runs/generalize") / task.name / name
+    open_run(folder, config, ignore=("run", "compute", "logger"))
     if (folder / "eval.json").exists():
-        result = runs.read_json(folder / "eval.json")
-        frozen.check_same(world_model, result, folder)
-        print(f"{folder} is done; delete it to run again")
-        return print_row(result)
-    torch.set_num_threads(config.threads)
+        result = read_json(folder / "eval.json")
+        check_same(world_model, result, folder)
+        print(f"{folder} is complete; delete it to run again\n\n{row_text(result, paper_numbers(result))}")
+        return
 
-    dataset = settings.find_or_record(config)
-    episodes, constants = settings.load_episodes(config, dataset)
-    fingerprint = frozen.train_policies(world_model, episodes, constants, folder, config, seeds)
-    result = write_report(folder, config, dataset, world_model, episodes["eval"], seeds, fingerprint, source)
-    print_row(result)
-    print(f"eval.json and all else is in {folder}")
+    torch.set_num_threads(config.compute.threads)
+    dataset = find_or_record(config.task, config.dataset)
+    episodes, constants = load_demonstrations(dataset)
+    judge = partial(judge_in_closed_loop, task=config.task, settings=config.eval)
+    fingerprint = train_policies(
+        world_model, episodes, constants, folder, config.policy,
+        judge=judge, seeds=seeds, compute=config.compute, logger=config.logger,
+    )  # fmt: skip
+    result = write_report(
+        folder, world_model, episodes["eval"], seeds,
+        task=config.task, dataset=dataset, policy=config.policy.kind, source=source,
+        settings=plain_settings(config), command=command_line(sys.argv), frozen=fingerprint, compare=paper_numbers,
+    )  # fmt: skip
+    print(f"\n{row_text(result, paper_numbers(result))}\nwritten: {folder}")
 
 
 if __name__ == "__main__":
-    run_recipe(main, Config)
+    run_recipe(main, Config, sys.argv)

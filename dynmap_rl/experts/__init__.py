@@ -1,5 +1,5 @@
 """State-based experts and the checkpoints that ship with the package."""
 
-from .network import ExpertNetwork, list_checkpoints, load_expert, make_actor, roll_out
+import lazy_loader
 
-__all__ = ["ExpertNetwork", "list_checkpoints", "load_expert", "make_actor", "roll_out"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

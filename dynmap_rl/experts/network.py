@@ -1,4 +1,4 @@
-"""The state-based expert: its network and the checkpoints that ship with the package (paper, Sec. IV-C)."""
+"""State-based experts: network, checkpoints and rollouts (paper, Sec. IV-C)."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ CHECKPOINTS = Path(__file__).parent / "checkpoints"
 
 
 class ExpertNetwork(nn.Module):
-    """State ``[..., S]`` to mean and standard deviation of the cart's acceleration ``[..., 3]`` (m/s^2, rad/s^2).
+    """Normal distribution of the cart's acceleration, from the state.
 
     Args:
-        state_size: S.
-        acceleration_limit: the largest acceleration of each axis; the mean is a ``tanh`` within it.
+        state_size: S, entries of the state.
+        acceleration_limit: largest acceleration of each axis (m/s^2, m/s^2, rad/s^2); the mean is a ``tanh`` within.
         hidden: width of the two hidden layers.
     """
 
@@ -39,12 +39,13 @@ class ExpertNetwork(nn.Module):
         self.register_buffer("limit", torch.as_tensor(acceleration_limit, dtype=torch.float32))
 
     def forward(self, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return mean and standard deviation ``[..., 3]`` (m/s^2, m/s^2, rad/s^2) for states ``[..., S]``."""
         mean = torch.tanh(self.mlp(state)) * self.limit
         return mean, (self.log_std.exp() * self.limit).expand_as(mean)
 
 
 def make_actor(network: ExpertNetwork) -> ProbabilisticActor:
-    """The network as a stochastic TensorDict policy: ``state`` to ``action`` and ``action_log_prob``."""
+    """Make a stochastic TensorDict policy: ``state`` to ``action`` and ``action_log_prob``."""
     module = TensorDictModule(network, in_keys=["state"], out_keys=["loc", "scale"])
     return ProbabilisticActor(
         module, in_keys=["loc", "scale"], distribution_class=IndependentNormal, return_log_prob=True
@@ -58,11 +59,13 @@ def play(
     scene_seeds: Sequence[int],
     states: BalanceReaching | None = None,
 ) -> Iterator[list[World]]:
-    """The worlds before each of the 120 steps of the mean action, one world a scene seed; in the end they are as the
-    last step left them.
+    """Yield the worlds before each of the 120 steps of the mean action; afterwards they are in their final state.
 
     Args:
-        states: the task whose ``state`` the expert was trained on, where it is not ``task``.
+        network: expert.
+        task: task to play.
+        scene_seeds: one world each.
+        states: task whose ``state`` the expert was trained on, where it is not ``task``.
     """
     worlds = [task.make_world(task.sample_scene(np.random.default_rng(seed))) for seed in scene_seeds]
     for _ in range(EPISODE_STEPS):
@@ -79,37 +82,44 @@ def roll_out(
     scene_seeds: Sequence[int],
     states: BalanceReaching | None = None,
 ) -> list[World]:
-    """:func:`play` to the end: the worlds as they are then."""
+    """Play episodes to the end (see :func:`play`) and return the worlds."""
     [worlds] = deque(play(network, task, scene_seeds, states), maxlen=1)
     return worlds
 
 
 def list_checkpoints(expert: str | Path) -> list[str]:
-    """The names of an expert's checkpoints, earliest first.
+    """Return the names of an expert's checkpoints, earliest first.
 
     Args:
-        expert: the name of a task whose expert ships with the package, or the ``checkpoint`` folder of a run of
+        expert: name of a task whose expert ships with the package, or the ``checkpoint`` folder of a run of
             ``recipes/expert.py``.
 
     Raises:
-        ValueError: there is none.
+        ValueError: there is no checkpoint.
     """
     names = [path.stem for path in find_expert(expert).glob("*.safetensors")]
     names.sort(key=lambda name: (len(name), name))  # iteration_1000 after iteration_995
     if not names:
         raise ValueError(
-            f"no expert at {expert}; train one with recipes/expert.py and name its checkpoint folder"
+            f"no expert at {expert}; train one with recipes/expert.py and give its checkpoint folder"
         )
     return names
 
 
 def load_expert(expert: str | Path, checkpoint: str | None = None) -> ExpertNetwork:
-    """An expert (see :func:`list_checkpoints`), the last checkpoint unless one is named. Its facts are in the JSON
-    file beside it."""
+    """Load an expert (see :func:`list_checkpoints`).
+
+    Args:
+        expert: name of a task, or a folder of checkpoints.
+        checkpoint: name of the checkpoint; by default the last one.
+
+    Raises:
+        ValueError: there is no such checkpoint, or it is damaged.
+    """
     known = list_checkpoints(expert)
     checkpoint = checkpoint or known[-1]
     if checkpoint not in known:
-        raise ValueError(f"no checkpoint {checkpoint!r} of the expert {expert}; choose from {known}")
+        raise ValueError(f"the checkpoint of {expert} must be one of {', '.join(known)}, got {checkpoint!r}")
     folder = find_expert(expert)
     facts = read_json(folder / f"{checkpoint}.json")
 
@@ -120,19 +130,26 @@ def load_expert(expert: str | Path, checkpoint: str | None = None) -> ExpertNetw
 
 
 def task_of_expert(expert: str | Path, task: BalanceReaching) -> BalanceReaching:
-    """The task whose ``state`` an expert sees (see :func:`list_checkpoints`), which it can play ``task`` by.
+    """Return the task whose ``state`` an expert was trained on.
+
+    Args:
+        expert: see :func:`list_checkpoints`.
+        task: task that the expert shall play.
 
     Raises:
-        ValueError: ``task`` has no such states.
+        ValueError: ``task`` does not have these states.
     """
     facts = read_json(find_expert(expert) / f"{list_checkpoints(expert)[-1]}.json", {"task": str})
-    sees = get_task(facts["task"], from_file=True)
-    if not issubclass(task.ranges.scene, sees.ranges.scene):
-        raise ValueError(f"the expert {expert} sees states of {sees.name}, which {task.name} does not have")
-    return sees
+    trained_on = get_task(facts["task"], from_file=True)
+    if not issubclass(task.ranges.scene, trained_on.ranges.scene):
+        raise ValueError(
+            f"the expert {expert} reads states of {trained_on.name}, which {task.name} does not have; choose another "
+            "--expert"
+        )
+    return trained_on
 
 
 def find_expert(expert: str | Path) -> Path:
-    """The folder of an expert's checkpoints: one that ships with the package, by its name, or the path itself."""
+    """Return the folder of an expert's checkpoints, shipped or named by its path."""
     shipped = CHECKPOINTS / expert
     return shipped if shipped.is_dir() else Path(expert)

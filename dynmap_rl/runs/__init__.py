@@ -1,16 +1,5 @@
-"""Run folders: settings, metrics, training state, and how a run is found again."""
+"""Run folders: settings, metrics, training state, and functions that find a run again."""
 
-from .folder import append_metrics, load_training_state, open_run, read_metrics, save_training_state
-from .lookup import find_run, load_actor, load_source, task_of_run
+import lazy_loader
 
-__all__ = [
-    "append_metrics",
-    "find_run",
-    "load_actor",
-    "load_source",
-    "load_training_state",
-    "open_run",
-    "read_metrics",
-    "save_training_state",
-    "task_of_run",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,7 +1,7 @@
 """Run folders: settings, metrics and training state, written so that a kill at any moment loses nothing.
 
-A run folder holds ``config.json``, ``metrics.jsonl`` (one JSON object a line), ``checkpoint/`` and the results.
-The same command on the same folder resumes it. Torch is imported where it is used, so that ``--help`` is quick.
+A run folder holds ``config.json``, ``metrics.jsonl`` (one JSON object a line), ``checkpoint/`` and the results. The
+same command on the same folder resumes the run. Torch is imported where it is used, so that ``--help`` is quick.
 """
 
 from __future__ import annotations
@@ -11,55 +11,69 @@ import io
 import json
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from dynmap_rl.utils.files import lock_folder, read_json, write_bytes, write_json
 
-if TYPE_CHECKING:
-    pass
+FORMAT = 2  # of config.json; the first release had flat settings
 
 
 def open_run(folder: Path, config, *, ignore: tuple[str, ...] = ()) -> Path:
-    """Create the folder, or reopen it where its settings are the same ones (but for ``ignore``); it is then this
-    process's until it ends.
+    """Create a run folder, or reopen it for the same settings, and lock it until this process ends.
 
     Args:
-        config: a dataclass of settings.
+        folder: run folder.
+        config: dataclass of settings.
+        ignore: names of settings that may differ from those of the folder.
+
+    Returns:
+        The folder.
 
     Raises:
-        ValueError: the folder holds a run with other settings, or another process works in it.
+        ValueError: the folder holds a run with other settings or of another release, or is in use.
     """
     folder = Path(folder)
     lock_folder(folder)
-    settings = json.loads(json.dumps(dataclasses.asdict(config), default=str))
+    settings = {"format": FORMAT, **plain_settings(config)}
     path = folder / "config.json"
-    if path.exists():
-        stored = read_json(path)
-        changed = {
-            k: (stored.get(k), settings.get(k))
-            for k in {*stored, *settings} - set(ignore)
-            if stored.get(k) != settings.get(k)
-        }
-        if changed:
-            detail = ", ".join(f"{k}: {old} there, {new} here" for k, (old, new) in sorted(changed.items()))
-            raise ValueError(
-                f"{folder} holds a run with other settings ({detail}); choose another --run, or delete it"
-            )
-    else:
+    if not path.exists():
         write_json(path, settings)
+        return folder
+    stored = read_json(path)
+    if stored.get("format") != FORMAT:
+        raise ValueError(
+            f"{folder} holds a run of another release, which cannot resume here; choose another --run"
+        )
+    old, new = (_flatten({k: v for k, v in s.items() if k not in ignore}) for s in (stored, settings))
+    if changed := sorted(k for k in {*old, *new} if old.get(k) != new.get(k)):
+        detail = ", ".join(f"{k}: {old.get(k)} there, {new.get(k)} here" for k in changed)
+        raise ValueError(
+            f"{folder} holds a run with other settings ({detail}); choose another --run, or delete the folder"
+        )
     return folder
+
+
+def plain_settings(config) -> dict:
+    """Return a dataclass of settings as a nested dict of JSON values."""
+    return json.loads(json.dumps(dataclasses.asdict(config), default=str))
+
+
+def _flatten(settings: dict, prefix: str = "") -> dict:
+    flat = {}
+    for name, value in settings.items():
+        flat |= _flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return flat
 
 
 def append_metrics(folder: Path, step: int, **metrics: float) -> None:
     """Append one line to ``metrics.jsonl``."""
-    line = json.dumps({"step": step, **{k: _plain(v) for k, v in metrics.items()}})
+    line = json.dumps({"step": step, **{name: _to_number(value) for name, value in metrics.items()}})
     Path(folder).mkdir(parents=True, exist_ok=True)
     with open(Path(folder) / "metrics.jsonl", "a") as file:
         file.write(line + "\n")
 
 
 def read_metrics(folder: Path) -> list[dict]:
-    """The lines of ``metrics.jsonl``; a last line cut short by a kill is left out.
+    """Read the lines of ``metrics.jsonl``, except for a last line that a kill has cut short.
 
     Raises:
         ValueError: an earlier line is damaged.
@@ -78,7 +92,7 @@ def read_metrics(folder: Path) -> list[dict]:
 
 
 def truncate_metrics(folder: Path, step: int) -> None:
-    """Drop the lines after ``step``: what a killed run wrote beyond its last training state."""
+    """Drop the lines after ``step``, which a killed run wrote after its last training state."""
     rows = [row for row in read_metrics(folder) if row["step"] <= step]
     write_bytes(Path(folder) / "metrics.jsonl", "".join(json.dumps(row) + "\n" for row in rows).encode())
 
@@ -94,7 +108,7 @@ def save_training_state(path: Path, **state) -> None:
 
 
 def load_training_state(path: Path) -> dict | None:
-    """What :func:`save_training_state` wrote, the generator restored; None where there is nothing yet.
+    """Load what :func:`save_training_state` wrote and restore the generators; None where there is no file yet.
 
     Raises:
         ValueError: the file is damaged.
@@ -114,8 +128,8 @@ def load_training_state(path: Path) -> dict | None:
     return state
 
 
-def _plain(value):
-    """Tensors and arrays as plain numbers or lists."""
+def _to_number(value):
+    """Convert tensors and arrays to plain numbers or lists."""
     if not hasattr(value, "tolist"):
         return value
     return value.item() if math.prod(value.shape) == 1 else value.tolist()

@@ -1,4 +1,4 @@
-"""Metrics: always as lines of JSON in the run folder, and by TorchRL's loggers where a user wants to watch them."""
+"""Metrics as lines of JSON in the run folder and, on request, in a TorchRL logger."""
 
 from __future__ import annotations
 
@@ -7,27 +7,34 @@ import importlib.util
 import uuid
 from pathlib import Path
 
-from .folder import append_metrics
 from dynmap_rl.utils.files import write_bytes
+
+from .folder import append_metrics
 
 LOGGERS = "tensorboard", "wandb", "trackio"
 
 
 def check_logger(name: str | None) -> None:
-    """Raises ``ValueError`` for an unknown logger, or one that is not installed."""
+    """Raise ``ValueError`` for a logger that is unknown or not installed."""
     if name is None:
         return
     if name not in LOGGERS:
-        raise ValueError(f"--logger is one of {', '.join(LOGGERS)}, not {name!r}")
+        raise ValueError(f"--logger must be one of {', '.join(LOGGERS)}, got {name!r}")
     if importlib.util.find_spec(name) is None:
         raise ValueError(f"--logger {name} needs its package: pip install '.[{name}]'")
 
 
 def log_metrics(folder: Path, step: int, logger: str | None = None, **metrics: float) -> None:
-    """Append a line to ``metrics.jsonl`` and, with a logger, give it the same numbers.
+    """Append a line to ``metrics.jsonl`` and pass the same numbers to a logger.
 
-    TensorBoard's files are in ``FOLDER/tensorboard``; W&B and Trackio call the run by its folder, in the project
+    TensorBoard writes to ``FOLDER/tensorboard``. W&B and Trackio name the run after its folder, in the project
     ``dynmap_rl``.
+
+    Args:
+        folder: run folder.
+        step: number of updates so far.
+        logger: ``tensorboard``, ``wandb``, ``trackio`` or None.
+        **metrics: numbers by name.
     """
     append_metrics(folder, step, **metrics)
     if logger:
@@ -42,7 +49,7 @@ def _open(name: str, folder: Path):
     if name == "tensorboard":
         return get_logger(name, str(folder), "tensorboard")
     options = {"project": "dynmap_rl"}
-    if name == "wandb":  # a run for each of a process's seeds, and the same one when it goes on
+    if name == "wandb":  # one run for each seed of a process, and the same run after a resume
         options |= {"id": _run_id(folder), "reinit": "create_new"}
     return get_logger(name, str(folder), folder.as_posix(), **{f"{name}_kwargs": options})
 

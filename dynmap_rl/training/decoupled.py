@@ -1,23 +1,22 @@
-"""Policies on a frozen world model, what decoupled training and generalisation share (paper, Sec. III-B and V-D).
+"""Policies on a frozen world model, for decoupled training and generalisation (paper, Sec. III-B and V-D).
 
-The world model's states are computed once; every policy seed is then trained, and judged, in a process of its own,
-and the weights of the world model are shown to be the same before and after.
+The world model's states are computed once. Every policy is then trained, and judged, in a process of its own. The
+fingerprint of the world model is the same before and after.
 """
 
 from __future__ import annotations
 
 import errno
 import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import nn
 
 from dynmap_rl.data.features import compute_features
-from dynmap_rl.envs.tasks import NO_TASK
-from dynmap_rl.evaluation.errors import policy_errors
-from dynmap_rl.evaluation.protocol import evaluate
-from dynmap_rl.modules.actor import Actor
 from dynmap_rl.modules.checkpoints import (
     load_policy,
     load_world_model,
@@ -26,19 +25,24 @@ from dynmap_rl.modules.checkpoints import (
     save_world_model,
 )
 from dynmap_rl.modules.world_model import WorldModel
-from .policy import train_policy
-from dynmap_rl.utils.devices import choose_device, seed_everything
+from dynmap_rl.utils.devices import Compute, choose_device, seed_everything
 from dynmap_rl.utils.files import read_json, write_json
 from dynmap_rl.utils.processes import run_processes
 from dynmap_rl.utils.weights import fingerprint
 
-TRAINED = "trained.json"  # written when a policy is: on which world model
+from .policy import train_policy
+from .settings import PolicyTraining
+
+TRAINED = "trained.json"  # written after a policy's training, with the world model's fingerprint
+Judge = Callable[[WorldModel, nn.Module], dict]
 
 
 def check_same(world_model: WorldModel, result: dict, folder: Path) -> None:
-    """Raises ``ValueError`` where the result of a run was made with another world model."""
+    """Raise ``ValueError`` if the result of a run was obtained with another world model."""
     if result["world_model_sha256"] != fingerprint(world_model):
-        raise ValueError(f"{folder} was made with another world model; choose another --run, or delete it")
+        raise ValueError(
+            f"{folder} was made with another world model; choose another --run, or delete the folder"
+        )
 
 
 def train_policies(
@@ -46,93 +50,110 @@ def train_policies(
     episodes: dict[str, TensorDictBase],
     constants: dict,
     folder: Path,
-    settings,
-    seeds: list[int],
+    settings: PolicyTraining | None = None,
+    *,
+    judge: Judge,
+    seeds: Sequence[int] = (0, 1, 2),
+    compute: Compute | None = None,
+    logger: str | None = None,
 ) -> str:
-    """Freeze the world model, train and judge a policy for every seed that ``folder`` does not hold yet.
+    """Freeze a world model; train and judge a policy for every seed that ``folder`` does not hold yet.
 
     Args:
         world_model: stays as it is.
-        episodes: ``train`` and ``eval``, ``[E, T]``.
+        episodes: ``train`` and ``eval``, TensorDicts ``[E, T]``.
         constants: of the dataset's normalisation.
         folder: run folder; gets ``world_model`` and ``seed_N`` with ``policy``, ``metrics.jsonl``, ``eval.json``.
-        settings: of the policy's training (see :func:`dynmap_rl.training.train_policy`) and evaluation, with
-            ``copies`` and ``device``.
-        seeds: of the policies.
+        settings: of the policies' training; default :class:`PolicyTraining`.
+        judge: function of world model and policy to the content of ``eval.json``. With more than one thread it must
+            be picklable, such as a ``functools.partial`` of
+            :func:`dynmap_rl.evaluation.protocol.judge_in_closed_loop`.
+        seeds: seeds of the policies.
+        compute: device, and policies trained at a time.
+        logger: ``tensorboard``, ``wandb``, ``trackio`` or None.
 
     Returns:
         The fingerprint of the frozen world model.
 
     Raises:
         ValueError: the frozen weights have changed.
-        OSError: a process died.
+        OSError: a process died, or the disk is full.
     """
+    settings, compute, folder = settings or PolicyTraining(), compute or Compute(), Path(folder)
     world_model.eval().requires_grad_(False)
     frozen = fingerprint(world_model)
     save_world_model(folder / "world_model", world_model)
-    todo = [seed for seed in seeds if not (folder / f"seed_{seed}" / "eval.json").exists()]
-    if todo:
-        device = choose_device(settings.device)
-        world_model.to(device)
-        generator = torch.Generator(device).manual_seed(0)
-        recolor = settings.task != NO_TASK
-        features = compute_features(
-            world_model, episodes["train"], settings.copies, generator, recolor=recolor
-        )
-        held_out = compute_features(world_model, episodes["eval"])
-        shutil.rmtree(folder / "features", ignore_errors=True)  # of a killed run
-        check_space(folder, features.bytes() + held_out.bytes())
+    if todo := [seed for seed in seeds if not (folder / f"seed_{seed}" / "eval.json").exists()]:
+        work = _Work(folder, constants, settings, judge, compute.device, logger, frozen)
+        states = folder / "features"
+        shutil.rmtree(states, ignore_errors=True)  # left behind by a kill
         try:
-            for name, values in (("train", features), ("eval", held_out)):
-                values.cpu().memmap(folder / "features" / name)
-            arguments = [(settings, folder, constants, seed, frozen) for seed in todo]
-            run_processes([_train, _evaluate], arguments, settings.threads)
+            _write_features(world_model, episodes, states, settings, compute.device)
+            run_processes([_train, _evaluate], [(work, seed) for seed in todo], compute.threads)
         finally:
-            shutil.rmtree(folder / "features", ignore_errors=True)
+            shutil.rmtree(states, ignore_errors=True)
     if fingerprint(load_world_model(folder / "world_model")) != frozen:
         raise ValueError(f"the frozen world model of {folder} has changed; delete the folder and run again")
     return frozen
 
 
+@dataclass(frozen=True)
+class _Work:
+    """What every seed shares, for processes of their own."""
+
+    folder: Path
+    constants: dict
+    settings: PolicyTraining
+    judge: Judge
+    device: str
+    logger: str | None
+    frozen: str
+
+
+def _write_features(world_model, episodes, states: Path, settings: PolicyTraining, device: str) -> None:
+    device = choose_device(device)
+    world_model.to(device)
+    generator = torch.Generator(device).manual_seed(0)
+    train = compute_features(
+        world_model, episodes["train"], settings.copies, generator, recolor=settings.recolor
+    )
+    held_out = compute_features(world_model, episodes["eval"])
+    check_space(states.parent, train.bytes() + held_out.bytes())
+    for name, values in (("train", train), ("eval", held_out)):
+        values.cpu().memmap(states / name)
+
+
 def check_space(folder: Path, size: int) -> None:
-    """Raises ``OSError`` where ``size`` bytes do not fit: a process that maps a file into memory would be killed."""
+    """Raise ``OSError`` if ``size`` bytes do not fit: a process that maps a file into memory would be killed."""
     if (free := shutil.disk_usage(folder).free) < size:
         raise OSError(errno.ENOSPC, f"{size / 1e6:.0f} MB are needed, {free / 1e6:.0f} are free", str(folder))
 
 
-def _train(arguments: tuple) -> None:
-    """One policy seed, unless it is trained already."""
-    settings, folder, constants, seed, frozen = arguments
-    path = folder / f"seed_{seed}"
-    if (path / TRAINED).exists() and read_json(path / TRAINED) == {"world_model_sha256": frozen}:
+def _train(arguments: tuple[_Work, int]) -> None:
+    """Train the policy of a seed, unless it is trained already."""
+    work, seed = arguments
+    path = work.folder / f"seed_{seed}"
+    if (path / TRAINED).exists() and read_json(path / TRAINED) == {"world_model_sha256": work.frozen}:
         return
     torch.set_num_threads(1)
     seed_everything(1000 + seed)
-    device = choose_device(settings.device)
-    world_model = load_world_model(folder / "world_model")
-    policy = make_policy(constants, settings.policy, world_model).to(device)
-    features = TensorDict.load_memmap(folder / "features" / "train")
-    held_out = TensorDict.load_memmap(folder / "features" / "eval")
-    train_policy(policy, features, held_out, path, settings, seed)
+    world_model = load_world_model(work.folder / "world_model")
+    policy = make_policy(work.constants, work.settings.kind, world_model).to(choose_device(work.device))
+    states = [TensorDict.load_memmap(work.folder / "features" / name) for name in ("train", "eval")]
+    train_policy(policy, *states, path, work.settings, seed=seed, logger=work.logger)
     save_policy(path / "policy", policy, world_model)
-    write_json(path / TRAINED, {"world_model_sha256": frozen})
+    write_json(path / TRAINED, {"world_model_sha256": work.frozen})
 
 
-def _evaluate(arguments: tuple) -> None:
-    """Judge a trained policy, and prove that the world model stayed as it was."""
-    settings, folder, _, seed, frozen = arguments
+def _evaluate(arguments: tuple[_Work, int]) -> None:
+    """Judge a trained policy, and check that the world model has not changed."""
+    work, seed = arguments
     torch.set_num_threads(1)
     seed_everything(1000 + seed)
-    device = choose_device(settings.device)
-    world_model = load_world_model(folder / "world_model").requires_grad_(False).to(device)
-    policy = load_policy(folder / f"seed_{seed}" / "policy").to(device)
-    if settings.task == NO_TASK:
-        held_out = TensorDict.load_memmap(folder / "features" / "eval")
-        result = {"held_out": policy_errors(policy, held_out)}
-    else:
-        episodes = settings.test_episodes, settings.paper_episodes
-        result = evaluate(Actor(world_model, policy, mixed=True), settings.task, *episodes, settings.split)
-    result["world_model_sha256"] = fingerprint(world_model)
-    if result["world_model_sha256"] != frozen:
+    device = choose_device(work.device)
+    world_model = load_world_model(work.folder / "world_model").requires_grad_(False).to(device)
+    policy = load_policy(work.folder / f"seed_{seed}" / "policy").to(device)
+    result = work.judge(world_model, policy) | {"world_model_sha256": fingerprint(world_model)}
+    if result["world_model_sha256"] != work.frozen:
         raise ValueError("the frozen world model has changed; this run is not valid")
-    write_json(folder / f"seed_{seed}" / "eval.json", result)
+    write_json(work.folder / f"seed_{seed}" / "eval.json", result)

@@ -1,4 +1,4 @@
-"""Training loops that the recipes share: the world model alone, and a policy on a frozen world model's states."""
+"""The loop over windows that every world-model training shares, and its optimiser."""
 
 from __future__ import annotations
 
@@ -12,40 +12,48 @@ from torch import nn
 from tqdm import tqdm
 
 from dynmap_rl.data.augmentation import add_distractors, augment
+from dynmap_rl.data.settings import Augmentation
 from dynmap_rl.data.windows import sample_windows
-from dynmap_rl.envs.tasks import NO_TASK
 from dynmap_rl.modules.precision import mixed_precision
-from dynmap_rl.modules.world_model import WorldModel
-from dynmap_rl.objectives.world_model import WorldModelLoss
 from dynmap_rl.runs.folder import load_training_state, save_training_state, truncate_metrics
 from dynmap_rl.runs.loggers import log_metrics
+
 from .parallel import differentiate, map_in_threads, split_batch
+from .settings import EndToEndTraining, WorldModelTraining
 
-ADVICE = "what was kept before stays; run again with a lower learning rate, in another --run"
-
-
-def _has_no_task(settings) -> bool:
-    return getattr(settings, "task", None) == NO_TASK
+ADVICE = "the last saved state is kept; run again with a lower learning rate, in another --run"
+SAVE_EVERY = 250  # updates
 
 
-def _make_loss(world_model: WorldModel, settings, generator: torch.Generator) -> WorldModelLoss:
-    weights = settings.beta_z, settings.beta_dynamics
-    return WorldModelLoss(world_model, *weights, rgb_steps=settings.rgb_steps, generator=generator)
-
-
-def _fit(
+def fit(
     model: nn.Module,
     make_loss: Callable[[torch.Generator], nn.Module],
     episodes: TensorDictBase,
     held_out: Callable[[], dict[str, float]],
     folder: Path,
-    settings,
+    settings: WorldModelTraining | EndToEndTraining,
     seed: int,
-    save_every: int,
-    limits: dict | None = None,
+    logger: str | None = None,
+    save_every: int = SAVE_EVERY,
 ) -> None:
-    """The loop over windows; ``limits`` are those of the augmentation. Every part of a batch has a generator of its own
-    (see :mod:`dynmap_rl.parts`), which also draws what its loss has to draw."""
+    """Minimise a loss on random windows of episodes; a stopped run resumes from its last training state.
+
+    Args:
+        model: all that is trained, changed in place.
+        make_loss: function that makes the loss module of a part of the batch, from the generator of its own (see
+            :mod:`dynmap_rl.training.parallel`).
+        episodes: training episodes ``[E, T]``.
+        held_out: metrics to log beside the losses.
+        folder: run folder; gets ``metrics.jsonl`` and the training state.
+        settings: sizes, augmentation and learning rate.
+        seed: seed of the windows.
+        logger: see :func:`dynmap_rl.runs.loggers.log_metrics`.
+        save_every: updates between training states.
+
+    Raises:
+        ValueError: the loss is not finite or diverges; the last training state is kept.
+    """
+    folder = Path(folder)
     device = next(model.parameters()).device
     model.to(memory_format=torch.channels_last)  # with bfloat16 six times faster on a CPU
     optimizer = make_optimizer(model, settings.learning_rate, weight_decay=1e-4)
@@ -56,7 +64,8 @@ def _fit(
     loss_modules = [make_loss(generator) for generator in generators]
 
     def find_losses(part: int) -> dict[str, torch.Tensor]:
-        windows = _draw_windows(episodes, sizes[part], settings, generators[part], limits or {})
+        windows = sample_windows(episodes, sizes[part], settings.window_steps, generators[part])
+        windows = change_windows(windows, settings.augmentation, generators[part])
         with mixed_precision(device):
             losses = loss_modules[part](windows)
         return {name: value * (sizes[part] / settings.windows) for name, value in losses.items()}
@@ -65,8 +74,8 @@ def _fit(
     if state := load_training_state(path):
         model.load_state_dict(state["model"])
         optimizer.load_state_dict(state["optimizer"])
-        start, first = state["update"], state.get("first_loss")
-        _restore(generators, state.get("generators", []), start)
+        start, first = state["update"], state["first_loss"]
+        _restore(generators, state["generators"], start)
     truncate_metrics(folder, start)
     progress = tqdm(range(start, settings.updates), folder.name, settings.updates, initial=start)
     with map_in_threads(len(sizes)) as map_parts:
@@ -81,7 +90,7 @@ def _fit(
                 first = check_loss(sum(losses.values()), norm, first)
                 progress.set_postfix({k.removeprefix("loss_"): f"{v:.3f}" for k, v in losses.items()})
             if saved:
-                log_metrics(folder, done, settings.logger, **losses, **held_out())
+                log_metrics(folder, done, logger, **losses, **held_out())
                 save_training_state(
                     path,
                     model=model.state_dict(),
@@ -92,15 +101,19 @@ def _fit(
                 )
 
 
-def _draw_windows(episodes, size: int, settings, generator: torch.Generator, limits: dict) -> TensorDictBase:
-    windows = sample_windows(episodes, size, settings.window_steps, generator)
-    if not _has_no_task(settings):
-        windows = augment(windows, generator, **limits)
-    return add_distractors(windows, generator, settings.distractors)
+def change_windows(
+    windows: TensorDictBase, settings: Augmentation, generator: torch.Generator
+) -> TensorDictBase:
+    """Apply the augmentations of the settings to windows ``[B, T]``."""
+    if settings.recolor or settings.mirror or settings.max_shift:
+        windows = augment(windows, generator, settings.max_shift, settings.mirror, settings.recolor)
+    if settings.distractors:
+        windows = add_distractors(windows, generator, settings.distractors)
+    return windows
 
 
 def _restore(generators: list[torch.Generator], states: list[torch.Tensor], update: int) -> None:
-    """Their states, or, where these are of another kind of device or of an earlier release, new ones."""
+    """Restore generators, or seed them anew where the states are of another kind of device."""
     shapes = [generator.get_state().shape for generator in generators]
     for part, generator in enumerate(generators):
         if [state.shape for state in states] == shapes:
@@ -110,38 +123,38 @@ def _restore(generators: list[torch.Generator], states: list[torch.Tensor], upda
 
 
 def make_optimizer(module: nn.Module, learning_rate: float, weight_decay: float) -> torch.optim.Optimizer:
-    """AdamW as all our trainings have it."""
+    """Make the AdamW optimiser of all trainings by imitation or prediction."""
     return torch.optim.AdamW(
         module.parameters(), learning_rate, betas=(0.9, 0.99), weight_decay=weight_decay, fused=True
     )
 
 
 def set_learning_rate(optimizer, peak: float, update: int, updates: int) -> None:
-    """100 steps of warm-up, then a cosine to 2 % of the peak."""
+    """Set the learning rate: 100 updates of warm-up, then a cosine to 2 % of the peak."""
     factor = min(1.0, (update + 1) / 100) * (0.51 + 0.49 * math.cos(math.pi * update / updates))
     for group in optimizer.param_groups:
         group["lr"] = peak * factor
 
 
 def step(loss: torch.Tensor, optimizer) -> torch.Tensor:
-    """One optimiser step with clipped gradients; their norm. Nothing in it waits for an accelerator."""
+    """Take one optimiser step with clipped gradients and return their norm, without waiting for a GPU."""
     optimizer.zero_grad()
     loss.backward()
     return descend(optimizer)
 
 
 def descend(optimizer) -> torch.Tensor:
-    """:func:`step` by the gradients that are there."""
+    """Take one optimiser step along gradients that are already computed; return their norm."""
     norm = nn.utils.clip_grad_norm_([p for g in optimizer.param_groups for p in g["params"]], 1.0)
     optimizer.step()
     return norm
 
 
 def check_loss(loss: float, norm: torch.Tensor, first: float | None = None) -> float:
-    """The run's first loss, or this one where it is the first.
+    """Return the first loss of a run, which is ``loss`` where ``first`` is None.
 
     Raises:
-        ValueError: the loss or the gradients' norm is not finite, or the loss is ten times what it was at first.
+        ValueError: loss or norm of the gradients is not finite, or the loss is ten times the first one.
     """
     if not (math.isfinite(loss) and norm.isfinite()):
         raise ValueError(f"the loss is not finite; {ADVICE}")

@@ -1,8 +1,7 @@
-"""The parts of a batch, each differentiated in a thread of its own.
+"""Gradients of the parts of a batch, each in a thread of its own.
 
-Threads that share every operation wait for each other hundreds of times an update; with a part each they meet once. On two free
-cores that takes as long, but where another program takes one of them, a third less; and as there are as many parts whatever
-the number of threads, one thread gives the same weights as two.
+Threads that share every operation wait for each other hundreds of times an update; threads with a part of the batch
+each wait once. There are as many parts with any number of threads, so that the weights do not depend on it.
 """
 
 from __future__ import annotations
@@ -19,14 +18,14 @@ Map = Callable[[Callable, Sequence], Iterator]
 
 
 def split_batch(size: int, device: torch.device) -> list[int]:
-    """The sizes of a batch's parts: halves on a CPU, the whole on a GPU."""
+    """Return the sizes of a batch's parts: halves on a CPU, the whole batch on a GPU."""
     parts = min(size, PARTS) if device.type == "cpu" else 1
     return [size // parts + (part < size % parts) for part in range(parts)]
 
 
 @contextmanager
 def map_in_threads(count: int) -> Iterator[Map]:
-    """A ``map`` that works in up to ``count`` threads, no more than torch's, which they share; with one, here."""
+    """Yield a ``map`` that works in up to ``count`` threads, which share torch's threads."""
     threads = torch.get_num_threads()
     if min(count, threads) == 1:
         yield map
@@ -36,9 +35,7 @@ def map_in_threads(count: int) -> Iterator[Map]:
         with ThreadPoolExecutor(min(count, threads), "part", torch.set_num_threads, (share,)) as pool:
             yield pool.map
     finally:
-        torch.set_num_threads(
-            threads
-        )  # of the libraries behind it, which the threads' own calls have changed
+        torch.set_num_threads(threads)  # the threads' own calls have changed the libraries' setting
 
 
 def differentiate(
@@ -47,13 +44,16 @@ def differentiate(
     parameters: Sequence[nn.Parameter],
     map_parts: Map = map,
 ) -> dict[str, torch.Tensor]:
-    """Sums over the parts: of their losses, which are returned, and of the gradients, which are left in ``grad``.
+    """Sum losses and gradients over the parts of a batch.
 
     Args:
-        losses: a part's losses by name, of which the sum is differentiated; already weighted by the part's share.
-        parts: what ``losses`` is called with.
-        parameters: those that no part depends on get no gradient.
-        map_parts: of :func:`map_in_threads`.
+        losses: function from a part to its losses by name, weighted by the part's share; their sum is differentiated.
+        parts: arguments of ``losses``.
+        parameters: get the sum of the gradients in ``grad``, or None where no part depends on them.
+        map_parts: see :func:`map_in_threads`.
+
+    Returns:
+        The summed losses by name, detached.
     """
 
     def work(part: int):
@@ -64,7 +64,7 @@ def differentiate(
     found, gradients = zip(*map_parts(work, parts), strict=True)
     for parameter, *of_parts in zip(parameters, *gradients, strict=True):
         of_parts = [g for g in of_parts if g is not None]
-        # In the parameter's own memory format, which fused optimisers take for granted.
+        # In the parameter's own memory format, which fused optimisers require.
         parameter.grad = torch.zeros_like(parameter) if of_parts else None
         for gradient in of_parts:
             parameter.grad += gradient

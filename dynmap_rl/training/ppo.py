@@ -1,4 +1,4 @@
-"""PPO, from states for the experts (paper, Sec. IV-C) and from whatever else an environment's ``state`` holds."""
+"""PPO on the entry ``state`` of an environment: of experts (paper, Sec. IV-C), or latents of a world model."""
 
 from __future__ import annotations
 
@@ -20,39 +20,42 @@ from dynmap_rl.envs.world import EPISODE_STEPS
 from dynmap_rl.experts.network import ExpertNetwork, make_actor
 from dynmap_rl.runs.folder import load_training_state, save_training_state, truncate_metrics
 from dynmap_rl.runs.loggers import log_metrics
-from .loop import check_loss
 from dynmap_rl.utils.devices import seed_everything
 from dynmap_rl.utils.files import write_json
 from dynmap_rl.utils.weights import save_weights
 
-POSITIVE = (  # settings
-    "num_envs", "iterations", "epochs", "minibatch", "checkpoint_every", "eval_episodes", "final_episodes", "threads",
-)  # fmt: skip
+from .loop import check_loss
+from .settings import PPOTraining
 
 
 def train_ppo(
     env: EnvBase,
     network: ExpertNetwork,
     folder: Path,
-    settings,
+    settings: PPOTraining,
+    *,
     judge: Callable[[int], dict[str, float]],
     facts: dict,
+    threads: int = 1,
+    logger: str | None = None,
 ) -> None:
-    """Train a network on ``state``; a stopped run goes on from its last iteration, to the same weights.
+    """Train a network by PPO; a stopped run resumes from its last iteration, to the same weights.
 
     Args:
         env: ``[N]`` worlds with ``state``, ``is_success`` and ``dropped``, controlled by accelerations.
         network: changed in place.
-        folder: run folder; gets ``metrics.jsonl`` and, in ``checkpoint``, ``iteration_NNN`` as safetensors and JSON
-            every ``checkpoint_every`` iterations, and the training state.
-        settings: with ``seed``, ``iterations``, ``epochs``, ``minibatch``, ``learning_rate``, ``gamma``,
-            ``gae_lambda``, ``clip``, ``entropy``, ``checkpoint_every``, ``eval_episodes``, ``final_episodes`` and ``threads``.
-        judge: rates of the network's mean action on so many fresh scenes, at least ``success`` and ``drop``.
-        facts: about the run, written to the JSON of each checkpoint with what ``judge`` says.
+        folder: run folder; gets ``metrics.jsonl`` and, in ``checkpoint``, the training state and every
+            ``checkpoint_every`` iterations ``iteration_NNN`` as safetensors and JSON.
+        settings: of PPO.
+        judge: function of a number of scenes to the rates of the mean action, at least ``success`` and ``drop``.
+        facts: entries of the JSON of each checkpoint, beside those of ``judge``.
+        threads: with two, actor and critic learn at the same time; the weights are the same.
+        logger: ``tensorboard``, ``wandb``, ``trackio`` or None.
 
     Raises:
-        ValueError: the loss is not finite; the last training state, from before, is kept. Or that is of an earlier release.
+        ValueError: the loss is not finite, or the training state is of an earlier release; the state is kept.
     """
+    folder = Path(folder)
     inputs, width = network.mlp[0].in_features, network.mlp[0].out_features
     actor = make_actor(network)
     critic = ValueOperator(
@@ -65,8 +68,8 @@ def train_ppo(
         actor,
         clip_epsilon=settings.clip,
         entropy_coeff=settings.entropy,
-        critic_coeff=None,  # `update` does it, at the same time
-        functional=False,  # which would put parameters in and out, a fourth of the time
+        critic_coeff=None,  # ``update`` computes that loss in another thread
+        functional=False,  # a functional call per minibatch takes a fourth of the time
     )
     networks = torch.nn.ModuleList([network, critic])
     optimizer = torch.optim.Adam(networks.parameters(), settings.learning_rate, eps=1e-5, fused=True)
@@ -81,7 +84,7 @@ def train_ppo(
         start, seconds = state["iteration"], state["seconds"]
     truncate_metrics(folder, start)
 
-    # Every iteration starts from fresh, seeded scenes, so that a resumed run equals an uninterrupted one.
+    # Every iteration starts from new, seeded scenes, so that a resumed run equals an uninterrupted one.
     frames = env.batch_size.numel() * EPISODE_STEPS
     progress = tqdm(
         range(start, settings.iterations), initial=start, total=settings.iterations, unit="iteration"
@@ -93,7 +96,7 @@ def train_ppo(
         for group in optimizer.param_groups:
             group["lr"] = settings.learning_rate * (1 - 0.9 * iteration / settings.iterations)
         batch = collect(env, network)
-        losses = update(batch, policy_loss, critic, advantage, optimizer, settings)
+        losses = update(batch, policy_loss, critic, advantage, optimizer, settings, threads)
         done = batch["next", "done"].squeeze(-1)
         seconds += time.perf_counter() - began
         metrics = {
@@ -104,7 +107,7 @@ def train_ppo(
             "drop": batch["next", "dropped"].squeeze(-1)[done].float().mean(),
             **losses,
         }
-        log_metrics(folder, iteration + 1, settings.logger, **metrics)
+        log_metrics(folder, iteration + 1, logger, **metrics)
         progress.set_postfix(success=f"{metrics['success']:.2f}", drop=f"{metrics['drop']:.2f}")
         last = iteration + 1 == settings.iterations
         if last or (iteration + 1) % settings.checkpoint_every == 0:
@@ -127,13 +130,13 @@ def train_ppo(
 
 @torch.no_grad()
 def collect(env: EnvBase, network: ExpertNetwork) -> TensorDictBase:
-    """An episode's length in each world, ``[N, T]``, by actions drawn from the network's normal distribution."""
+    """Roll out one episode's length in each world, ``[N, T]``, with actions drawn from the network's distribution."""
 
     def act(td: TensorDictBase) -> TensorDictBase:
         return td.set("action", torch.normal(*network(td["state"])))
 
     batch = env.rollout(EPISODE_STEPS, act, break_when_any_done=False)
-    # The probabilities of all at once: a distribution a step takes longer than the network.
+    # All probabilities at once: one distribution a step takes longer than the network.
     distribution = IndependentNormal(*network(batch["state"]))
     return batch.set("action_log_prob", distribution.log_prob(batch["action"]))
 
@@ -144,9 +147,14 @@ def update(
     critic: ValueOperator,
     advantage: GAE,
     optimizer,
-    settings,
+    settings: PPOTraining,
+    threads: int = 1,
 ) -> dict[str, float]:
-    """PPO's epochs of minibatches over one batch ``[N, T]``; ``ValueError`` where a loss is not finite."""
+    """Run the epochs of minibatches over one batch ``[N, T]`` and return the last losses.
+
+    Raises:
+        ValueError: a loss is not finite.
+    """
     with torch.no_grad():
         batch = advantage(batch)
     batch = batch.select("state", "action", "action_log_prob", "advantage", "value_target").reshape(-1)
@@ -162,17 +170,17 @@ def update(
         (losses["loss_objective"] + losses["loss_entropy"]).backward()
         return losses.detach()
 
-    # The two networks have nothing in common: each learns in a thread of its own, where there are two.
+    # The two networks share no weights: with two threads each learns in a thread of its own.
     with ThreadPoolExecutor(1) as other:
         for _ in range(settings.epochs):
             for part in batch[torch.randperm(len(batch))].split(settings.minibatch):
                 optimizer.zero_grad()
-                values = other.submit(learn_values, part) if settings.threads > 1 else None
+                values = other.submit(learn_values, part) if threads > 1 else None
                 losses = learn_actions(part)
                 losses["loss_critic"] = values.result() if values else learn_values(part)
                 norm = torch.nn.utils.clip_grad_norm_(parameters, 0.5)
                 optimizer.step()
-    # Weights that are not finite stay so: the last loss tells. Nor is there a first loss to compare with: the critic's
-    # rises with the returns, in a good run fivefold.
+    # Weights that are not finite stay so: the last loss suffices. There is no first loss to compare with, since the
+    # critic's rises with the returns.
     check_loss((losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]).item(), norm)
     return {k: losses[k].item() for k in ("loss_objective", "loss_critic", "entropy")}

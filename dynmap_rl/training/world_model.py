@@ -1,47 +1,73 @@
-"""Training loops that the recipes share: the world model alone, and a policy on a frozen world model's states."""
+"""Training of a world model alone (paper, Eq. 4a and 5)."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import torch
 from tensordict import TensorDictBase
 
 from dynmap_rl.evaluation.errors import prediction_errors
+from dynmap_rl.modules.checkpoints import make_world_model
+from dynmap_rl.modules.supervision import parse_supervision
 from dynmap_rl.modules.world_model import WorldModel
-from .loop import _fit, _has_no_task, _make_loss
+from dynmap_rl.objectives.world_model import WorldModelLoss
+
+from .loop import SAVE_EVERY, fit
+from .settings import JointTraining, WorldModelArchitecture, WorldModelTraining
+
+
+def build_world_model(constants: dict, settings: WorldModelArchitecture) -> WorldModel:
+    """Make a world model with random weights.
+
+    Args:
+        constants: of the dataset's normalisation, ``{name: {"low": [D], "high": [D]}}``.
+        settings: form of the world model.
+    """
+    return make_world_model(constants, parse_supervision(settings.supervision), keypoints=settings.keypoints)
 
 
 def train_world_model(
     world_model: WorldModel,
     episodes: dict[str, TensorDictBase],
     folder: Path,
-    settings,
-    save_every: int = 250,
+    settings: WorldModelTraining | None = None,
+    *,
+    logger: str | None = None,
+    by_entry: bool = False,
+    save_every: int = SAVE_EVERY,
 ) -> None:
-    """Minimise Eq. 4a plus Eq. 5 on augmented windows; a stopped run goes on from its last training state.
+    """Minimise the losses of Eq. 4a and 5 on augmented windows; a stopped run resumes.
 
     Args:
-        world_model: changed in place.
-        episodes: ``train`` and ``eval``, ``[E, T]``.
+        world_model: changed in place; its supervision and form are its own, not those of the settings.
+        episodes: ``train`` and ``eval``, TensorDicts ``[E, T]``.
         folder: run folder; gets ``metrics.jsonl`` and the training state.
-        settings: with ``updates``, ``windows``, ``window_steps``, ``rgb_steps``, ``distractors``,
-            ``learning_rate``, ``beta_z``, ``beta_dynamics`` and ``world_model_seed``. Windows are as they are where its
-            ``task`` is none: what may be changed in the frames of others is not known.
+        settings: sizes, weights and learning rate; default :class:`WorldModelTraining`.
+        logger: ``tensorboard``, ``wandb``, ``trackio`` or None.
+        by_entry: log held-out errors for every entry of the dynamics, as robot datasets need.
+        save_every: updates between training states.
 
     Raises:
-        ValueError: the loss is not finite or diverges; the last training state, from before, is kept.
+        ValueError: the loss is not finite or diverges; the last training state is kept.
     """
-
-    def held_out() -> dict[str, float]:
-        return prediction_errors(world_model, episodes["eval"], by_entry=_has_no_task(settings))
-
-    _fit(
+    settings = settings or WorldModelTraining()
+    fit(
         world_model,
-        lambda generator: _make_loss(world_model, settings, generator),
+        lambda generator: make_loss(world_model, settings, generator),
         episodes["train"],
-        held_out,
+        lambda: prediction_errors(world_model, episodes["eval"], by_entry=by_entry),
         folder,
         settings,
-        settings.world_model_seed,
+        settings.seed,
+        logger,
         save_every,
     )
+
+
+def make_loss(
+    world_model: WorldModel, settings: WorldModelTraining | JointTraining, generator: torch.Generator
+) -> WorldModelLoss:
+    """Make the world model's loss module, whose decoded frames ``generator`` draws."""
+    weights = settings.beta_z, settings.beta_dynamics
+    return WorldModelLoss(world_model, *weights, rgb_steps=settings.rgb_steps, generator=generator)

@@ -1,4 +1,4 @@
-"""Recipes as commands: settings from the command line, and one line for what goes wrong.
+"""Recipes as commands: typed settings from the command line, and one line for an expected error.
 
 Torch is imported where it is used, so that ``--help`` is quick.
 """
@@ -13,38 +13,43 @@ import os
 import re
 import shlex
 import sys
-from collections.abc import Iterable
+import typing
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 HINTS = {
     **dict.fromkeys(
-        (errno.ENOSPC, errno.EDQUOT, errno.EFBIG), "make room; the same command goes on where it was"
+        (errno.ENOSPC, errno.EDQUOT, errno.EFBIG), "free some space and repeat the command, which resumes"
     ),
     **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "choose a folder that can be written to"),
     **dict.fromkeys((errno.EEXIST, errno.ENOTDIR, errno.EISDIR), "choose another path"),
 }
 OUT_OF_MEMORY = re.compile("out of memory|can't allocate memory")
-MEMORY = (
-    "there is not enough memory for this; make --windows, --policy_batch, --num_envs or --episodes smaller"
-)
+MEMORY = "not enough memory; reduce the batch (windows, batch, num_envs) or the number of episodes"
 
 
-def run_recipe(main, config_class) -> None:
-    """Parse the settings, run ``main(config)``, and turn an expected error into one line and exit code 2.
+def run_recipe(main: Callable, config_class: type, argv: Sequence[str]) -> None:
+    """Parse the settings and call ``main(config)``.
 
-    ``--debug`` (anywhere on the command line) shows the traceback instead.
+    An expected error is printed as one line, and the process exits with code 2. ``--debug``, anywhere among the
+    arguments, shows the traceback instead.
+
+    Args:
+        main: the recipe.
+        config_class: dataclass of its settings; nested dataclasses become options such as ``--eval.split``.
+        argv: ``sys.argv``.
     """
     import draccus
 
-    # Large pages for torch's memory, whose small ones cost a fifth of a world model's training.
+    # Large pages for torch's memory: small ones cost a fifth of a world model's training.
     os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
-    sys.path.append(os.getcwd())  # where the module of a task named module:Class may lie; it shadows nothing
-    given = [a for a in sys.argv[1:] if a != "--debug"]
-    debug = len(given) < len(sys.argv) - 1
+    sys.path.append(os.getcwd())  # a task named module:Class may lie here
+    given = [argument for argument in argv[1:] if argument != "--debug"]
+    debug = len(given) < len(argv) - 1
     try:
         main(draccus.parse(config_class, args=read_arguments(given, config_class), exit_on_error=False))
     except KeyboardInterrupt:
-        sys.exit("stopped; the same command goes on where it was")
+        sys.exit("stopped; the same command resumes")
     except Exception as error:
         message = describe_error(error)
         if debug or message is None:
@@ -53,69 +58,96 @@ def run_recipe(main, config_class) -> None:
         sys.exit(2)
 
 
-def read_arguments(given: list[str], config_class) -> list[str]:
-    """The arguments with underscores in the names of options (``--dry-run`` is ``--dry_run``), and ``true`` behind bare
-    flags.
+def list_options(config_class: type, prefix: str = "--") -> dict[str, type]:
+    """Return the type of every option of a dataclass of settings, nested ones by their dotted names."""
+    options = {}
+    for name, kind in typing.get_type_hints(config_class).items():
+        if dataclasses.is_dataclass(kind):
+            options |= list_options(kind, f"{prefix}{name}.")
+        else:
+            options[f"{prefix}{name}"] = kind
+    return options
+
+
+def read_arguments(given: Sequence[str], config_class: type) -> list[str]:
+    """Normalise arguments: ``--dry-run`` becomes ``--dry_run``, and a bare flag is followed by ``true``.
 
     Raises:
-        ValueError: the settings have no such option.
+        ValueError: an option is unknown.
     """
-    fields = {f"--{field.name}": field for field in dataclasses.fields(config_class)}
+    options = list_options(config_class)
     arguments = []
     for i, argument in enumerate(given):
         name, equals, value = argument.partition("=")
         if name.startswith("--"):
             name = f"--{name[2:].replace('-', '_')}"
-            if name not in {*fields, "--help", "--config_path"}:
-                close = difflib.get_close_matches(name, fields, 1)
-                raise ValueError(
-                    f"there is no option {name}; {f'do you mean {close[0]}?' if close else 'see --help'}"
-                )
+            if name not in {*options, "--help", "--config_path"}:
+                raise ValueError(f"unknown option {name}; {_suggest(name, options)}")
             argument = name + equals + value
         arguments.append(argument)
-        flag = argument in fields and fields[argument].type in (bool, "bool")
+        flag = options.get(argument) is bool
         if flag and "".join(given[i + 1 : i + 2]).lower() not in ("true", "false"):
             arguments.append("true")
     return arguments
 
 
-def describe_error(error: Exception) -> str | None:
-    """What went wrong and what to do; None where it is a mistake of ours."""
+def _suggest(name: str, options: dict[str, type]) -> str:
+    nested = [option for option in options if option.replace(".", "_").endswith(name[2:].replace(".", "_"))]
+    close = nested or difflib.get_close_matches(name, options, 1)
+    return f"do you mean {' or '.join(close)}?" if close else "see --help"
+
+
+def describe_error(error: BaseException) -> str | None:
+    """Return what went wrong and what to do, or None for an error that no user has caused."""
     from draccus.utils import DraccusException
 
-    if isinstance(error, MemoryError) or (
-        isinstance(error, RuntimeError) and OUT_OF_MEMORY.search(str(error))
-    ):
-        return MEMORY  # torch says it by a RuntimeError
+    while isinstance(error, DraccusException) and error.__cause__ is not None:
+        error = error.__cause__  # raised by the settings themselves
+    # Torch raises a RuntimeError where it finds no memory.
+    out_of_memory = isinstance(error, RuntimeError) and OUT_OF_MEMORY.search(str(error))
+    if isinstance(error, MemoryError) or out_of_memory:
+        return MEMORY
     if not isinstance(error, ValueError | OSError | argparse.ArgumentError | DraccusException):
         return None
     hint = HINTS.get(getattr(error, "errno", None))
     return f"{error}; {hint}" if hint else str(error)
 
 
-def replace_defaults(config, values: dict) -> None:
-    """Set those fields of a dataclass that still have their default and are not on the command line: what was asked
-    for stays."""
-    given = {a.partition("=")[0][2:].replace("-", "_") for a in sys.argv[1:] if a.startswith("--")}
-    for name, value in values.items():
-        if name not in given and getattr(config, name) == getattr(type(config), name):
-            setattr(config, name, value)
+def refuse(settings, default, names: Sequence[str], other: str, prefix: str = "") -> None:
+    """Refuse options that have no effect.
 
+    Args:
+        settings: dataclass of settings.
+        default: the same dataclass with its defaults.
+        names: fields that must have their default.
+        other: option because of which they have no effect.
+        prefix: of the options' names, such as ``world_model.``.
 
-def check_at_least_one(config, *names: str) -> None:
-    """Raises ``ValueError`` for one of these settings that is below 1; those that there are not do not matter."""
+    Raises:
+        ValueError: one of the fields differs from its default.
+    """
     for name in names:
-        if (value := getattr(config, name, 1)) < 1:
-            raise ValueError(f"--{name} must be at least 1, not {value}")
+        if getattr(settings, name) != getattr(default, name):
+            raise ValueError(f"--{prefix}{name} has no effect with {other}; leave it out")
 
 
-def refuse(config, names: Iterable[str], why: str) -> None:
-    """Raises ``ValueError`` for one of these settings that is not its default, and would say nothing here."""
-    for name in names:
-        if getattr(config, name) != getattr(type(config), name):
-            raise ValueError(f"--{name} {why}; leave it out")
+def parse_seeds(text: str) -> list[int]:
+    """Parse seeds such as ``0,1,2``.
+
+    Raises:
+        ValueError: an entry is no whole number, or occurs twice.
+    """
+    try:
+        seeds = [int(seed) for seed in text.split(",")]
+    except ValueError as error:
+        raise ValueError(f"--seeds must be whole numbers such as 0,1,2, got {text!r}") from error
+    if len(set(seeds)) < len(seeds):
+        raise ValueError(f"--seeds must be different numbers, got {text}")
+    return seeds
 
 
-def command_line() -> str:
-    """The command that started this process, as it would be given in the root of the repository."""
-    return shlex.join(["python", f"recipes/{Path(sys.argv[0]).name}", *sys.argv[1:]])
+def command_line(argv: Sequence[str]) -> str:
+    """Return the command of a recipe as it is given in the root of the repository."""
+    parts = Path(argv[0]).resolve().parts
+    start = len(parts) - 1 - parts[::-1].index("recipes") if "recipes" in parts else -1
+    return shlex.join(["python", "/".join(parts[start:]), *argv[1:]])

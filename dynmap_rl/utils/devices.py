@@ -1,40 +1,49 @@
-"""Run folders: settings, metrics and training state, written so that a kill at any moment loses nothing.
-
-A run folder holds ``config.json``, ``metrics.jsonl`` (one JSON object a line), ``checkpoint/`` and the results.
-The same command on the same folder resumes it. Torch is imported where it is used, so that ``--help`` is quick.
-"""
+"""Devices, threads and seeds. Torch is imported where it is used, so that ``--help`` is quick."""
 
 from __future__ import annotations
 
 import random
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+
+from .settings import check_at_least, check_choice
 
 if TYPE_CHECKING:
     import torch
 
 
+@dataclass(frozen=True)
+class Compute:
+    """Device and cores of a run; neither is part of its settings, and a run may resume with others."""
+
+    # cpu, cuda, or auto: the GPU where PyTorch finds one.
+    device: str = "auto"
+    # Cores: threads of one training, or trainings at a time.
+    threads: int = 2
+
+    def __post_init__(self):
+        check_choice(self, "device", ("auto", "cpu", "cuda"))
+        check_at_least(self, 1, "threads")
+
+
 def choose_device(name: str) -> torch.device:
-    """The device of a name; ``auto`` is the GPU where there is one.
+    """Return the device of a name; ``auto`` is the GPU where PyTorch finds one.
 
     Raises:
-        ValueError: there is no such device here.
+        ValueError: PyTorch does not find the device.
     """
     import torch
 
     gpu = torch.cuda.is_available()
-    if name not in ("auto", "cpu", "cuda"):
-        raise ValueError(f"--device is auto, cpu or cuda, not {name!r}")
     if name == "cuda" and not gpu:
-        raise ValueError(
-            "--device cuda: PyTorch finds no GPU here; leave it out, or install a CUDA build of PyTorch"
-        )
+        raise ValueError("device cuda: PyTorch finds no GPU; use cpu, or install a CUDA build of PyTorch")
     return torch.device("cuda" if gpu and name != "cpu" else "cpu")
 
 
 def seed_everything(seed: int) -> None:
-    """Seed Python, NumPy and torch."""
+    """Seed the generators of Python, NumPy and torch."""
     import torch
 
     random.seed(seed)

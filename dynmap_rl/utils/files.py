@@ -1,30 +1,24 @@
-"""Run folders: settings, metrics and training state, written so that a kill at any moment loses nothing.
-
-A run folder holds ``config.json``, ``metrics.jsonl`` (one JSON object a line), ``checkpoint/`` and the results.
-The same command on the same folder resumes it. Torch is imported where it is used, so that ``--help`` is quick.
-"""
+"""Files that are whole at any moment: atomic writes, JSON whose structure is checked, locked folders."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    pass
-
-
-LOCKS = {}  # of this process's folders: released when nothing refers to them
+LOCKS = {}  # locks of this process by path; a lock is released when nothing refers to it
 
 
 def write_json(path: Path, value) -> None:
-    """Write ``value`` as :func:`write_bytes` does."""
+    """Write a value as JSON, atomically (see :func:`write_bytes`)."""
     write_bytes(path, f"{_dump(value)}\n".encode())
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write under a temporary name, then rename: the file is whole or as it was, and nothing else is left (but by a
-    kill, whose leftovers the next write of the same file removes)."""
+    """Write a file under a temporary name, then rename it.
+
+    The file is complete or unchanged at any moment. A temporary file that a kill leaves behind is overwritten by the
+    next write.
+    """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.tmp")
@@ -39,13 +33,14 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def read_json(path: Path, form=dict):
-    """What a JSON file holds.
+    """Read a JSON file.
 
     Args:
-        form: that it must have, see :func:`check_form`.
+        path: file to read.
+        form: structure that the value must have (see :func:`check_form`).
 
     Raises:
-        ValueError: it is not valid JSON, not a file of UTF-8, or of another form; the message names the file.
+        ValueError: the file is not valid JSON in UTF-8, or the value has another structure.
     """
     try:
         value = json.loads(Path(path).read_text())
@@ -56,21 +51,24 @@ def read_json(path: Path, form=dict):
 
 
 def check_form(value, form, where: str) -> None:
-    """Refuse JSON in which something is missing, or is not what it should be.
+    """Check the structure of a JSON value.
 
     Args:
-        form: a type; ``[form]`` for a list of such values; ``{name: form}`` for a dict that has these, and maybe others;
-            ``{str: form}`` for one of any names.
-        where: the value is, for the message.
+        value: what was read.
+        form: a type; ``[form]`` for a list of such values; ``{name: form}`` for a dict with at least these entries;
+            ``{str: form}`` for a dict with any names.
+        where: place of the value, for the message.
 
     Raises:
-        ValueError: the value is of another form.
+        ValueError: an entry is missing or has another type.
     """
     kind = form if isinstance(form, type) else type(form)
     if not isinstance(value, kind):
         text = json.dumps(value)
         text = text if len(text) < 40 else f"{text[:40]} ..."
-        raise ValueError(f"{where} is {text}, not of the type {kind.__name__}; restore the file or delete it")
+        raise ValueError(
+            f"{where} must be of the type {kind.__name__}, got {text}; restore the file or delete it"
+        )
     if isinstance(form, list):
         for number, entry in enumerate(value):
             check_form(entry, form[0], f"{where}, {number}")
@@ -80,10 +78,10 @@ def check_form(value, form, where: str) -> None:
 
 
 def lock_folder(folder: Path) -> None:
-    """Make the folder, and keep it for this process until it ends.
+    """Create a folder and lock it until this process ends.
 
     Raises:
-        ValueError: another process works in it.
+        ValueError: another process has locked it.
     """
     from filelock import FileLock, Timeout
 
@@ -93,11 +91,13 @@ def lock_folder(folder: Path) -> None:
         LOCKS[path] = FileLock(path, timeout=0, is_singleton=True)
         LOCKS[path].acquire()
     except Timeout as error:
-        raise ValueError(f"another process works in {folder}; wait for it, or stop it") from error
+        raise ValueError(
+            f"{folder} is in use by another process; wait for that process or stop it"
+        ) from error
 
 
 def _dump(value, indent: str = "") -> str:
-    """JSON with an entry a line, but lists of plain values in one."""
+    """Return JSON with one entry a line, and lists of plain values on a single line."""
     inner = indent + " "
     if isinstance(value, dict) and value:
         lines = [f"{inner}{json.dumps(str(k))}: {_dump(v, inner)}" for k, v in value.items()]

@@ -1,8 +1,4 @@
-"""Run folders: settings, metrics and training state, written so that a kill at any moment loses nothing.
-
-A run folder holds ``config.json``, ``metrics.jsonl`` (one JSON object a line), ``checkpoint/`` and the results.
-The same command on the same folder resumes it. Torch is imported where it is used, so that ``--help`` is quick.
-"""
+"""Work in processes of its own, which end with the process that started them."""
 
 from __future__ import annotations
 
@@ -16,15 +12,18 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    pass
 
 
 def run_processes(stages: Sequence[Callable[[tuple], None]], arguments: list[tuple], count: int) -> None:
-    """Every stage of each argument, ``count`` at a time, each in a process of its own; one at a time, or one alone, in
-    this one. A stage waits until the one before is done for this argument, and for the first stages of all.
+    """Run every stage on each argument, ``count`` at a time, each in a process of its own.
+
+    A stage begins when the stage before it is done for its argument and the first stages of all arguments have
+    started. With one process or one argument, everything runs in this process.
+
+    Args:
+        stages: functions of one argument, in order.
+        arguments: what the stages are called with.
+        count: largest number of processes.
 
     Raises:
         OSError: a process died.
@@ -45,38 +44,40 @@ def run_processes(stages: Sequence[Callable[[tuple], None]], arguments: list[tup
                     if later:
                         running[pool.submit(later[0], one)] = one, later[1:]
         except BrokenProcessPool as error:
-            raise OSError("a process died (of memory?); the same command goes on") from error
+            raise OSError("a process died, perhaps for want of memory; the same command resumes") from error
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
 
 
 def start_worker() -> None:
-    """End at once and without a word on Ctrl-C, and when the parent ends, even if it is killed."""
+    """End this process silently on Ctrl-C, and when its parent ends, even by a kill."""
     from tqdm import tqdm
 
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    tqdm.set_lock(threading.RLock())  # its own is a semaphore, which Python would report as leaked
+    tqdm.set_lock(threading.RLock())  # tqdm's own lock is a semaphore, which Python would report as leaked
     parent = multiprocessing.parent_process()
     threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
 
 
 def run_script(script: Path, arguments: list[str], folder: Path, log: Path) -> int:
-    """``python SCRIPT ARGUMENTS`` in a folder, what it prints added to ``log``, in a process of its own; its exit code.
+    """Run ``python SCRIPT ARGUMENTS`` in a process of its own and return the exit code.
 
-    It ends with this process, even if this is killed.
+    Args:
+        script: file to run.
+        arguments: of the command line.
+        folder: working directory.
+        log: file to which the output is appended.
     """
     arguments = str(script), arguments, folder, log
     process = multiprocessing.get_context("spawn").Process(target=_run_here, args=arguments)
     process.start()
-    while process.exitcode is None:  # join alone may miss it where another thread starts a process
+    while process.exitcode is None:  # join alone may miss the end where another thread starts a process
         process.join()
     return process.exitcode
 
 
 def _run_here(script: str, arguments: list[str], folder: Path, log: Path) -> None:
-    from .processes import start_worker
-
     start_worker()
     with open(log, "a") as file:
         for stream in (sys.stdout, sys.stderr):

@@ -1,5 +1,4 @@
-"""The weights of modules as safetensors: files from strangers run no code, and take memory in
-proportion to their size."""
+"""Weights as safetensors: a file from elsewhere runs no code and takes memory in proportion to its size."""
 
 from __future__ import annotations
 
@@ -21,10 +20,14 @@ def save_weights(path: Path, module: nn.Module) -> None:
 
 
 def load_module[Module: nn.Module](path: Path, make: Callable[[], Module]) -> Module:
-    """What ``make`` makes, with the weights of a safetensors file.
+    """Make a module and load the weights of a safetensors file into it.
 
-    Nothing is allocated before it is known that the file has the module's names and shapes: how large a module is
-    may be said by a file from elsewhere.
+    The names and shapes of the file are compared with the module's before anything is allocated, since a file from
+    elsewhere may name any size.
+
+    Args:
+        path: file of the weights.
+        make: function that makes the module.
 
     Raises:
         ValueError: the file is missing, damaged, or does not fit the module.
@@ -43,13 +46,13 @@ def load_module[Module: nn.Module](path: Path, make: Callable[[], Module]) -> Mo
         module.load_state_dict(load_file(path))
     except OSError:
         raise
-    except Exception as error:  # of torch for impossible sizes, of safetensors for damaged files
+    except Exception as error:  # torch on impossible sizes, safetensors on damaged files
         raise ValueError(f"{path} does not hold this model's weights: {error}") from error
     return module
 
 
 def fingerprint(module: nn.Module) -> str:
-    """SHA-256 over all weights and buffers: equal before and after means that nothing has changed."""
+    """Return the SHA-256 of all weights and buffers; it is equal before and after where nothing has changed."""
     digest = hashlib.sha256()
     for name, value in sorted(module.state_dict().items()):
         digest.update(name.encode())

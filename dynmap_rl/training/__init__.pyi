@@ -1,0 +1,16 @@
+from .dataset import find_or_record as find_or_record
+from .decoupled import train_policies as train_policies
+from .joint import train_end_to_end as train_end_to_end
+from .joint import train_jointly as train_jointly
+from .joint import train_seeds as train_seeds
+from .policy import train_policy as train_policy
+from .ppo import train_ppo as train_ppo
+from .settings import EndToEndTraining as EndToEndTraining
+from .settings import JointTraining as JointTraining
+from .settings import PolicyArchitecture as PolicyArchitecture
+from .settings import PolicyTraining as PolicyTraining
+from .settings import PPOTraining as PPOTraining
+from .settings import WorldModelArchitecture as WorldModelArchitecture
+from .settings import WorldModelTraining as WorldModelTraining
+from .world_model import build_world_model as build_world_model
+from .world_model import train_world_model as train_world_model

@@ -1,0 +1,172 @@
+"""Typed settings of every training. A comment above a field is the help text of its option."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from dynmap_rl.data.settings import Augmentation
+from dynmap_rl.keys import DYNAMICS
+from dynmap_rl.utils.settings import check_at_least, check_choice
+
+
+@dataclass(frozen=True)
+class WorldModelArchitecture:
+    """Form of a world model."""
+
+    # Dynamics that the world model predicts: any of position,velocity,acceleration, or none (Only-RGB).
+    supervision: str = "position,velocity"
+    # Add spatial-softmax keypoints to the features of the plain CNN (beyond the paper).
+    keypoints: bool = False
+
+    def __post_init__(self):
+        for name in self.supervision.split(","):
+            if name.strip() not in ("none", *DYNAMICS) or (
+                "none" in self.supervision and "," in self.supervision
+            ):
+                raise ValueError(
+                    f"{type(self).__name__}.supervision must be any of {', '.join(DYNAMICS)} with commas between, or "
+                    f"none, got {self.supervision!r}"
+                )
+
+
+@dataclass(frozen=True)
+class WorldModelTraining(WorldModelArchitecture):
+    """Form and training of a world model (paper, Eq. 4a and 5)."""
+
+    # Optimiser steps.
+    updates: int = 2500
+    # Windows in a batch.
+    windows: int = 16
+    # Time steps of a window.
+    window_steps: int = 24
+    # Frames decoded in a window, drawn at random.
+    rgb_steps: int = 8
+    # Peak learning rate (100 steps of warm-up, then a cosine).
+    learning_rate: float = 2e-3
+    # Weight of the latent loss (Eq. 4a).
+    beta_z: float = 0.1
+    # Weight of the loss of every supervised quantity (Eq. 5).
+    beta_dynamics: float = 1.0
+    # Seed of weights and windows.
+    seed: int = 0
+    # Random changes of the windows.
+    augmentation: Augmentation = Augmentation()
+
+    def __post_init__(self):
+        super().__post_init__()
+        check_at_least(self, 1, "updates", "windows", "rgb_steps")
+        check_at_least(self, 2, "window_steps")
+        check_at_least(self, 0, "learning_rate", "beta_z", "beta_dynamics")
+
+
+@dataclass(frozen=True)
+class PolicyArchitecture:
+    """Form of a policy."""
+
+    # feedforward (paper, Eq. 1) or recurrent (Eq. 2).
+    kind: str = "recurrent"
+
+    def __post_init__(self):
+        check_choice(self, "kind", ("feedforward", "recurrent"))
+
+
+@dataclass(frozen=True)
+class PolicyTraining(PolicyArchitecture):
+    """Form and training of a policy on the states of a frozen world model."""
+
+    # Optimiser steps.
+    updates: int = 2500
+    # Episodes in a batch.
+    batch: int = 32
+    # Copies of every demonstration, each from a random step on.
+    copies: int = 2
+    # Permute the colour channels of the copies.
+    recolor: bool = True
+    # Peak learning rate (100 steps of warm-up, then a cosine).
+    learning_rate: float = 3e-3
+    # Extra weight of steps in which the expert changes its action (see imitation_loss); 0 is the paper's plain L1.
+    emphasis: float = 60.0
+
+    def __post_init__(self):
+        super().__post_init__()
+        check_at_least(self, 1, "updates", "batch")
+        check_at_least(self, 0, "copies", "learning_rate", "emphasis")
+
+
+@dataclass(frozen=True)
+class EndToEndTraining:
+    """Training of world model and policy by the policy's loss alone (paper, Eq. 3)."""
+
+    # Optimiser steps.
+    updates: int = 2500
+    # Windows in a batch.
+    windows: int = 8
+    # Time steps of a window.
+    window_steps: int = 48
+    # Peak learning rate (100 steps of warm-up, then a cosine).
+    learning_rate: float = 2e-3
+    # Extra weight of steps in which the expert changes its action (see imitation_loss); 0 is the paper's plain L1.
+    emphasis: float = 60.0
+    # Random changes of the windows; mirroring and shifting need a symmetric task.
+    augmentation: Augmentation = Augmentation()
+
+    def __post_init__(self):
+        check_at_least(self, 1, "updates", "windows")
+        check_at_least(self, 2, "window_steps")
+        check_at_least(self, 0, "learning_rate", "emphasis")
+
+
+@dataclass(frozen=True)
+class JointTraining(EndToEndTraining):
+    """Training of world model and policy with one loss (paper, Eq. 4 and 5)."""
+
+    # Frames decoded in a window, drawn at random.
+    rgb_steps: int = 16
+    # Weight of the latent loss (Eq. 4a).
+    beta_z: float = 0.1
+    # Weight of the loss of every supervised quantity (Eq. 5).
+    beta_dynamics: float = 1.0
+    # Weight of the policy's loss (Eq. 4).
+    beta_joint: float = 1.0
+
+    def __post_init__(self):
+        super().__post_init__()
+        check_at_least(self, 1, "rgb_steps")
+        check_at_least(self, 0, "beta_z", "beta_dynamics", "beta_joint")
+
+
+@dataclass(frozen=True)
+class PPOTraining:
+    """Training of a stochastic policy by PPO (paper, Sec. IV-C)."""
+
+    # Seed of everything random.
+    seed: int = 0
+    # Worlds stepped together; an iteration runs one episode's length in all of them.
+    num_envs: int = 64
+    # Iterations: rollouts and the updates from them.
+    iterations: int = 45
+    # Passes over the frames of an iteration.
+    epochs: int = 10
+    # Frames in a minibatch.
+    minibatch: int = 1024
+    # Initial learning rate, which falls to a tenth.
+    learning_rate: float = 5e-4
+    # Discount factor of a step.
+    gamma: float = 0.97
+    # Lambda of the generalised advantage estimates.
+    gae_lambda: float = 0.95
+    # Limit of the probability ratio.
+    clip: float = 0.2
+    # Weight of the entropy.
+    entropy: float = 1e-3
+    # Iterations between checkpoints.
+    checkpoint_every: int = 5
+    # Scenes on which a checkpoint is judged, with the policy's mean action.
+    eval_episodes: int = 200
+    # Scenes on which the last checkpoint is judged.
+    final_episodes: int = 1000
+
+    def __post_init__(self):
+        names = "num_envs", "iterations", "epochs", "minibatch", "checkpoint_every"
+        check_at_least(self, 1, *names, "eval_episodes", "final_episodes")
+        check_at_least(self, 0, "learning_rate", "gamma", "gae_lambda", "clip", "entropy")

@@ -1,0 +1,20 @@
+"""Checks that dataclasses of settings share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+
+def check_at_least(settings, low: float, *names: str) -> None:
+    """Raise ``ValueError`` for a field below ``low``."""
+    for name in names:
+        if (value := getattr(settings, name)) < low:
+            raise ValueError(f"{type(settings).__name__}.{name} must be at least {low}, got {value}")
+
+
+def check_choice(settings, name: str, choices: Sequence[str]) -> None:
+    """Raise ``ValueError`` for a field that is none of the choices."""
+    if (value := getattr(settings, name)) not in choices:
+        raise ValueError(
+            f"{type(settings).__name__}.{name} must be one of {', '.join(choices)}, got {value!r}"
+        )

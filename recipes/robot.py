@@ -1,0 +1,143 @@
+"""Train on a robot dataset: any LeRobot v3.0 dataset with an action, a camera and dynamics columns.
+
+    python recipes/add_dynamics.py --dataset user/name --columns 0,1,2 --output datasets/mine
+    python recipes/robot.py --dataset datasets/mine
+    python recipes/robot.py --dataset datasets/mine --method joint --goal observation.state:3,4
+
+World model and policies are trained in decoupled form (recipes/decoupled.py) or jointly (recipes/joint.py). Without a
+simulator there is no closed loop: the result is the errors on held-out episodes. The same command resumes a stopped
+run, and prints the result of a finished one.
+"""
+
+import os
+import sys
+from dataclasses import dataclass, fields
+from functools import partial
+from pathlib import Path
+
+from dynmap_rl.data.settings import Augmentation
+
+from dynmap_rl.training.settings import (
+    JointTraining,
+    PolicyArchitecture,
+    PolicyTraining,
+    WorldModelArchitecture,
+    WorldModelTraining,
+)
+from dynmap_rl.utils.cli import command_line, parse_seeds, refuse, run_recipe
+from dynmap_rl.utils.devices import Compute
+
+# The symmetries of the tasks' scenes, and the weight of changed actions, need not hold for a robot.
+WORLD_MODEL = WorldModelTraining(augmentation=Augmentation.off())
+POLICY = PolicyTraining(recolor=False, emphasis=0.0)
+JOINT = JointTraining(augmentation=Augmentation.off(), emphasis=0.0)
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of the recipe."""
+
+    # Dataset: a folder or a hub id. Required.
+    dataset: str | None = None
+    # Camera's column; by default the first camera.
+    camera: str | None = None
+    # Goal's column and entries, such as observation.state:3,4; by default no goal.
+    goal: str | None = None
+    # decoupled (world model first, then policies on its states) or joint (one loss).
+    method: str = "decoupled"
+    # Run folder; by default runs/robot/DATASET/METHOD_SUPERVISION_KIND.
+    run: Path | None = None
+    # Seeds of the policies.
+    seeds: str = "0,1,2"
+    # World model.
+    world_model: WorldModelTraining = WORLD_MODEL
+    # Policies.
+    policy: PolicyTraining = POLICY
+    # Joint training, with --method joint.
+    joint: JointTraining = JOINT
+    # Device and cores.
+    compute: Compute = Compute()
+    # Logger beside metrics.jsonl: tensorboard, wandb or trackio.
+    logger: str | None = None
+
+
+def main(config: Config) -> None:
+    """Train, measure and report."""
+    import torch
+
+    from dynmap_rl.data.robot import describe_robot_dataset, load_robot_dataset
+    from dynmap_rl.evaluation.errors import judge_held_out
+    from dynmap_rl.modules.supervision import parse_supervision
+    from dynmap_rl.reporting.robot_page import robot_row_text, write_robot_report
+    from dynmap_rl.runs.folder import open_run, plain_settings
+    from dynmap_rl.runs.loggers import check_logger
+    from dynmap_rl.training.decoupled import train_policies
+    from dynmap_rl.training.joint import train_seeds
+    from dynmap_rl.training.world_model import build_world_model, train_world_model
+    from dynmap_rl.utils.devices import choose_device, seed_everything
+    from dynmap_rl.utils.files import read_json
+
+    check_config(config)
+    seeds, device = parse_seeds(config.seeds), choose_device(config.compute.device)
+    check_logger(config.logger)
+    supervision = parse_supervision(config.world_model.supervision)
+    describe_robot_dataset(config.dataset, config.camera, config.goal, supervision)
+    folder = config.run or default_folder(config)
+    open_run(folder, config, ignore=("run", "compute", "logger"))
+    if (folder / "eval.json").exists():
+        result = read_json(folder / "eval.json")
+        print(f"{folder} is complete; delete it to run again\n\n{robot_row_text(result)}")
+        return
+
+    torch.set_num_threads(config.compute.threads)
+    steps = (config.joint if config.method == "joint" else config.world_model).window_steps
+    load = partial(load_robot_dataset, config.dataset, steps, config.camera, config.goal)
+    judge, fingerprint = partial(judge_held_out, load=load), None
+    episodes, constants = load()
+    common = {"judge": judge, "seeds": seeds, "compute": config.compute, "logger": config.logger}
+    if config.method == "joint":
+        parts = config.world_model, config.policy, config.joint
+        world_model = train_seeds(load, folder, *parts, by_entry=True, **common)
+    else:
+        seed_everything(config.world_model.seed)
+        world_model = build_world_model(constants, config.world_model).to(device)
+        settings = config.world_model
+        train_world_model(world_model, episodes, folder, settings, logger=config.logger, by_entry=True)
+        fingerprint = train_policies(world_model, episodes, constants, folder, config.policy, **common)
+    result = write_robot_report(
+        folder, world_model, episodes["eval"], seeds,
+        dataset=config.dataset, camera=config.camera, goal=config.goal, policy=config.policy.kind,
+        source={"training": config.method, "dataset": config.dataset},
+        settings=plain_settings(config), command=command_line(sys.argv), frozen=fingerprint,
+    )  # fmt: skip
+    print(f"\n{robot_row_text(result)}\nwritten: {folder}")
+
+
+def check_config(config: Config) -> None:
+    """Raise ``ValueError`` for a missing dataset, an unknown method, or options that have no effect."""
+    if not config.dataset:
+        raise ValueError("--dataset must be a folder or a hub id; name the dataset to train on")
+    if config.method not in ("decoupled", "joint"):
+        raise ValueError(f"--method must be decoupled or joint, got {config.method!r}")
+
+    def own(settings: type, base: type) -> list[str]:
+        return [field.name for field in fields(settings) if field.name not in {f.name for f in fields(base)}]
+
+    other = f"--method {config.method}"
+    if config.method == "joint":
+        names = own(WorldModelTraining, WorldModelArchitecture)
+        refuse(config.world_model, WORLD_MODEL, names, other, "world_model.")
+        refuse(config.policy, POLICY, own(PolicyTraining, PolicyArchitecture), other, "policy.")
+    else:
+        refuse(config.joint, JOINT, [field.name for field in fields(JointTraining)], other, "joint.")
+
+
+def default_folder(config: Config) -> Path:
+    """Return the run folder of the settings."""
+    dataset = os.path.basename(os.path.abspath(config.dataset))  # never ".."
+    supervision = config.world_model.supervision.replace(",", "_")
+    return Path("runs/robot") / dataset / f"{config.method}_{supervision}_{config.policy.kind}"
+
+
+if __name__ == "__main__":
+    run_recipe(main, Config, sys.argv)
