@@ -24,7 +24,7 @@ class Config:
     run: Path | None = None
     # Training.
     ppo: PPOTraining = PPOTraining()
-    # Threads that simulate, and in which the two networks learn; they change no result.
+    # With two threads, actor and critic learn at the same time; the result is the same.
     threads: int = 2
     # Logger beside metrics.jsonl: tensorboard, wandb or trackio.
     logger: str | None = None
@@ -52,7 +52,7 @@ def main(config: Config) -> None:
     check_logger(config.logger)
     ppo = config.ppo
     torch.set_num_threads(1)  # these networks are too small for more
-    env = DynmapBatchedEnv(config.task, ppo.num_envs, control="acceleration", threads=config.threads)
+    env = DynmapBatchedEnv(config.task, ppo.num_envs, control="acceleration")
     # A run may resume with more iterations.
     comparable = replace(config, ppo=replace(ppo, iterations=PPOTraining().iterations))
     folder = config.run or Path("runs/expert") / env.task.name

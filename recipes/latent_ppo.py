@@ -31,7 +31,7 @@ class Config:
     ppo: PPOTraining = PPOTraining(iterations=90, checkpoint_every=10)
     # Width of the network's hidden layers.
     hidden: int = 128
-    # Threads of torch and of the simulator.
+    # Threads of torch.
     threads: int = 2
     # Logger beside metrics.jsonl: tensorboard, wandb or trackio.
     logger: str | None = None

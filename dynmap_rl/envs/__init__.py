@@ -1,27 +1,5 @@
-"""Worlds, tasks and their adapters: Gymnasium ids, one batched TorchRL environment, and the world model in TorchRL."""
+"""Tasks, their simulator, and its environments for Gymnasium and TorchRL; a world model as transform and as environment."""
 
-import importlib
+import lazy_loader
 
-from .scene import Scene, SceneRanges, sample_scene, scene_seed
-from .world import World
-
-_MODULES = {
-    "BalanceReaching": "tasks",
-    "DynmapBatchedEnv": "torchrl_env",
-    "DynmapEnv": "gym_env",
-    "ImaginationEnv": "imagination",
-    "WorldModelTransform": "world_model_transform",
-    "get_task": "tasks",
-    "make_start": "imagination",
-}
-__all__ = [*_MODULES, "Scene", "SceneRanges", "World", "sample_scene", "scene_seed"]
-
-
-def __getattr__(name: str):
-    if name in _MODULES:
-        return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return __all__
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

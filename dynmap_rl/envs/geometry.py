@@ -1,4 +1,4 @@
-"""The tasks' shapes in the plane: goal marker, obstacle, bin, and the way around an obstacle. Lengths in m."""
+"""Shapes of the tasks in the plane: goal marker, obstacle, bin, and the way around an obstacle. Lengths in m."""
 
 from __future__ import annotations
 
@@ -16,39 +16,39 @@ MARGIN = 0.03  # m, between the obstacle and the largest cart and block
 
 
 def square(x: float, y: float, side: float) -> Polygon:
-    """The corners of an upright square around a point (m)."""
+    """Return the corners of an upright square around a point."""
     half = side / 2
     return [(x - half, y - half), (x + half, y - half), (x + half, y + half), (x - half, y + half)]
 
 
 def wall_polygon(start: Point, end: Point) -> Polygon:
-    """The rectangle around a wall that stands or lies straight."""
+    """Return the corners of the rectangle around a vertical or horizontal wall."""
     (x0, x1), (y0, y1) = sorted((start[0], end[0])), sorted((start[1], end[1]))
     r = WALL_RADIUS
     return [(x0 - r, y0 - r), (x1 + r, y0 - r), (x1 + r, y1 + r), (x0 - r, y1 + r)]
 
 
 def segment(scene: ObstacleScene) -> Wall:
-    """The obstacle's ends."""
+    """Return the ends of the obstacle's middle line."""
     x, y, half = scene.obstacle_x, scene.obstacle_y, scene.obstacle_length / 2 - WALL_RADIUS
     return (x, y - half), (x, y + half)
 
 
 def bin_walls(scene: BinScene) -> list[Wall]:
-    """Left wall, floor and right wall, outside the bin's inner width and depth."""
+    """Return left wall, floor and right wall, outside the bin's inner width and depth."""
     left, right = (scene.goal_x + side * (scene.bin_width / 2 + WALL_RADIUS) for side in (-1, 1))
     top, floor = scene.goal_y - WALL_RADIUS, scene.goal_y - scene.bin_depth - WALL_RADIUS
     return [((left, top), (left, floor)), ((left, floor), (right, floor)), ((right, floor), (right, top))]
 
 
 def path_is_blocked(scene: ObstacleScene) -> bool:
-    """Whether cart or block, moved along the straight line from start to goal, would touch the obstacle."""
+    """Return whether cart or block would touch the obstacle on the straight line from start to goal."""
     way = np.linspace((scene.cart_x, scene.cart_y), (scene.goal_x, scene.goal_y), 200)
     return any(hits(scene, x, y) for x, y in way)
 
 
 def hits(scene: ObstacleScene, x: float, y: float) -> bool:
-    """Whether the level cart at (x, y) (m), or the block upright on it, overlaps the obstacle."""
+    """Return whether the level cart at (x, y), or the block upright on it, overlaps the obstacle."""
     half = scene.obstacle_length / 2
     across = scene.obstacle_x - x
 
@@ -62,25 +62,29 @@ def hits(scene: ObstacleScene, x: float, y: float) -> bool:
 
 
 def keep_out(scene: ObstacleScene) -> tuple[Point, Point]:
-    """Two corners, lower left and upper right, of where the cart's centre must not be, so that the rectangle around
-    the largest cart and block of the default ranges stays a margin away from the obstacle. The same for all sizes, so
-    that the way around it can be learnt from where cart and goal are."""
+    """Return the rectangle that the cart's centre must avoid, as its lower left and upper right corner.
+
+    Outside of it, the rectangle around the largest cart and block of the default ranges stays 30 mm away from the
+    obstacle. It is the same for all sizes of cart and block, so that the way around it depends on positions alone.
+    """
     x, y = scene.obstacle_x, scene.obstacle_y
     half_width = max(scene.cart_width, *SIZES.cart_width) / 2 + WALL_RADIUS + MARGIN
     half_height = scene.obstacle_length / 2 + max(scene.cart_height, *SIZES.cart_height) / 2 + MARGIN
     low = y - half_height - max(scene.block_height, *SIZES.block_height)
-    low = low if low > WORKSPACE_LOW[1] else -1.0  # no way under it
+    low = low if low > WORKSPACE_LOW[1] else -1.0  # too little room under the obstacle
     return (x - half_width, low), (x + half_width, y + half_height)
 
 
 def is_inside(point: Point, low: Point, high: Point) -> bool:
-    """Whether the point lies within the rectangle, its edge left out."""
+    """Return whether the point lies inside the rectangle; its edge is outside."""
     return low[0] < point[0] < high[0] and low[1] < point[1] < high[1]
 
 
 def way_around(scene: ObstacleScene, start: Point, goal: Point) -> list[Point]:
-    """The shortest way of the cart's centre around ``keep_out``: its points from start to goal. From a point within
-    it the way leads straight out first."""
+    """Return the points of the shortest way of the cart's centre around :func:`keep_out`, from start to goal.
+
+    From a point inside the rectangle the way first leads straight out.
+    """
     low, high = keep_out(scene)
     outside = [leave(start, low, high), leave(goal, low, high)]
     if is_clear(*outside, low, high):
@@ -98,17 +102,17 @@ def way_around(scene: ObstacleScene, start: Point, goal: Point) -> list[Point]:
 
 
 def way_from_start(scene: ObstacleScene) -> list[Point]:
-    """The same from where the scene's cart starts to its goal."""
+    """Return the points of the shortest way from the start of the scene to its goal (see :func:`way_around`)."""
     return way_around(scene, (scene.cart_x, scene.cart_y), (scene.goal_x, scene.goal_y))
 
 
 def length(way: list[Point]) -> float:
-    """Of a way through points (m)."""
+    """Return the length of a way through points."""
     return sum(map(math.dist, way, way[1:]))
 
 
 def leave(point: Point, low: Point, high: Point) -> Point:
-    """The point itself, or, where it lies in the rectangle, the nearest one on its edge."""
+    """Return the point itself, or the nearest one on the rectangle's edge if it lies inside."""
     if not is_inside(point, low, high):
         return point
     (x, y), (x0, y0), (x1, y1) = point, low, high
@@ -117,7 +121,7 @@ def leave(point: Point, low: Point, high: Point) -> Point:
 
 
 def is_clear(start: Point, end: Point, low: Point, high: Point) -> bool:
-    """Whether a straight line stays out of the inside of a rectangle; it may run along its edge."""
+    """Return whether a straight line avoids the inside of a rectangle; it may run along its edge."""
     enter, exit = 0.0, 1.0
     for a, b, lower, upper in zip(start, end, low, high, strict=True):
         if a == b:

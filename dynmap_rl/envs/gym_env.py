@@ -10,8 +10,9 @@ from gymnasium import spaces
 
 from .renderer import Renderer, Window
 from .scene import SceneRanges, choose_ranges
+from .task import Task
 from .tasks import get_task
-from .world import ACCELERATION_LIMIT, CONTROL_DT, EPISODE_STEPS, VELOCITY_LIMIT
+from .world import ACCELERATION_LIMIT, CONTROL_DT, EPISODE_STEPS, VELOCITY_LIMIT, World
 
 ACTION_LIMITS = {"position": VELOCITY_LIMIT * CONTROL_DT, "acceleration": ACCELERATION_LIMIT}
 OBS_TYPES = ("state", "pixels", "pixels_agent_pos")
@@ -21,59 +22,70 @@ class DynmapEnv(gym.Env):
     """A cart carries a free-standing block over a 1 m x 1 m scene, controlled at 20 Hz.
 
     Description:
-        The block stands on the cart, held by nothing but friction. It tips when the cart accelerates faster than
-        about ``9.81 * block_width / block_height`` (2.9 to 4.9 m/s^2 here). Every episode has its own sizes,
-        positions and colours. An episode lasts 120 steps (6 s).
+        The block stands on the cart and is held by friction alone. It tips when the cart accelerates faster than
+        about ``9.81 * block_width / block_height`` (2.9 to 4.9 m/s^2 in the default ranges). Sizes, positions and
+        colours change with every episode. An episode lasts 120 steps (6 s). There are three tasks:
+        ``balance_reaching`` (task 1: carry the block to the goal), ``balance_reaching_obstacle`` (task 2: the same
+        around an obstacle) and ``bin_dropping`` (task 3: tip the block into a bin).
 
     Action:
         ``control="position"``: float32 ``(3,)``, the change dX, dY, dTheta of the commanded cart pose in one step,
-        at most 20 mm, 20 mm, 50 mrad (0.4 m/s, 1 rad/s). ``control="acceleration"``: float32 ``(3,)``, the cart's
-        acceleration, at most 3 m/s^2, 3 m/s^2, 10 rad/s^2. Both go through the same limits of speed, acceleration
-        and room to brake before the edge of the workspace. Both are SI units, so that actions mean the same in
-        datasets, in TorchRL and here; ``gymnasium.wrappers.RescaleAction`` makes them -1 to 1, which learners that
-        explore with noise of size 1 need.
+        at most 20 mm, 20 mm, 50 mrad (0.4 m/s, 0.4 m/s, 1 rad/s). ``control="acceleration"``: float32 ``(3,)``, the
+        acceleration of the cart, at most 3 m/s^2, 3 m/s^2, 10 rad/s^2. In both cases the cart stays within its limits
+        of speed and acceleration and brakes before the edge of the workspace. Actions are in SI units and mean the
+        same in datasets, in TorchRL and here. ``gymnasium.wrappers.RescaleAction`` scales them to -1 to 1, for
+        learners that explore with noise of size 1.
 
     Observation:
-        ``state``: float32 ``(16,)`` or, in tasks 2 and 3, ``(20,)``, privileged, for experts (see ``state``
-        of each task in ``dynmap_rl.envs.tasks``).
+        ``state``: float32 ``(16,)`` in task 1 and ``(20,)`` in tasks 2 and 3, privileged, for experts (see the classes
+        of the tasks).
         ``pixels``: uint8 ``(64, 64, 3)``.
-        ``pixels_agent_pos``: a dict of ``pixels`` and ``agent_pos``, float32 ``(5,)``: commanded cart pose x, y,
-        theta and goal x, y (m, m, rad, m, m).
+        ``pixels_agent_pos``: dict of ``pixels`` and ``agent_pos``, float32 ``(5,)``: commanded cart pose x, y, theta
+        and goal x, y (m, m, rad, m, m).
 
     Goal:
-        Task 1, ``balance_reaching``, and task 2, ``balance_reaching_obstacle``: where the cart's centre shall be, a
-        green square. Task 3, ``bin_dropping``: the middle of the green bin's opening.
+        Tasks 1 and 2: target of the cart's centre, a green square. Task 3: middle of the green bin's opening.
 
     Reward:
-        About -1 to 1 a step (see ``reward`` of each task). Task 1: by the goal distance. Task 2: by the length of
-        the way around the obstacle, -1 for a drop or a touch. Task 3: 1 with the block in the bin, -1 once it
-        missed or the cart touched the bin, and up to 0.2 for a block that is near.
+        About -1 to 1 a step; the classes of the tasks have the formulas. Task 1: grows with a smaller goal distance,
+        0 once the block is dropped. Task 2: grows with a shorter way around the obstacle, -1 once the block is dropped
+        or the obstacle touched. Task 3: 1 with the block in the bin, up to 0.2 for a block near it, -1 once the block
+        missed the bin or the cart touched it.
 
-    Success, drop, touch, position error:
-        ``info`` holds ``is_success``, ``dropped``, ``touched`` (cart or block touched obstacle or bin) and
-        ``position_error`` (m, the mean distance of cart and goal in the last 10 steps), as numpy scalars.
-        Dropped: the block leans over by more than 45 degrees relative to the cart, its centre is below half its
-        standing height, or it is beyond the cart's edge; a drop is never taken back. Success of task 1, on the last
-        step only: never dropped, and a position error under 50 mm. Of task 2: the obstacle is also untouched. Of
-        task 3, in every step of which it is true: the block rests in the bin, which the cart never touched.
+    Success:
+        Tasks 1 and 2, true in the last step only: the block was never dropped, the position error is under 50 mm, and
+        in task 2 nothing touched the obstacle. Task 3, true in each step in which it holds: the block rests in the
+        bin, and the cart never touched the bin.
+
+    Info:
+        ``is_success``, ``dropped``, ``touched`` and ``position_error``, as numpy scalars. ``dropped``: the block was
+        ever not carried, that is, it leaned over by more than 45 degrees relative to the cart, its centre was below
+        half its standing height, or it was beyond the cart's edge. ``touched``: cart or block ever touched the
+        obstacle or the bin. ``position_error``: mean distance (m) of cart and goal in the last 10 steps.
 
     Starting state:
-        Drawn from ``ranges`` by the seed; block upright and at rest on a level, resting cart.
+        Sizes, positions and colours are drawn from ``ranges`` by the seed. The block is upright and at rest on a
+        level, resting cart.
 
-    Termination, truncation:
-        Terminated when the episode has failed for good (task 1: dropped; task 2: dropped or obstacle touched; task 3:
-        the block fell below the bin's floor beside it, or the cart touched the bin), truncated after 120 steps.
+    Termination:
+        The episode terminates when it has failed for good. Task 1: the block is dropped. Task 2: the block is dropped
+        or the obstacle touched. Task 3: the block fell below the bin's floor beside it, or the cart touched the bin.
+        The episode is truncated after 120 steps.
 
     Args:
-        task: name of the task, or ``"module:Class"`` of your own.
+        task: name of the task, or ``"module:Class"`` of your own (see :class:`dynmap_rl.envs.Task`).
         obs_type: ``state``, ``pixels`` or ``pixels_agent_pos``.
         control: ``position`` or ``acceleration``.
-        ranges: what scenes are drawn from; by default the task's own.
+        ranges: ranges from which scenes are drawn; by default the task's own.
         render_mode: ``rgb_array``, ``human`` (a window that shows every step in real time), or None.
-        render_size: side of what ``render()`` returns or shows, in pixels.
+        render_size: side of the picture that ``render()`` returns or shows, in pixels.
+
+    Raises:
+        ValueError: an argument is not valid.
 
     Reset arguments:
-        ``reset(options={"cart_x": 0.3, "block_color": (0, 0, 90), ...})`` fixes any factor of the scene.
+        ``seed`` determines the scene. ``options`` fixes any of its factors (see :class:`dynmap_rl.envs.Scene`):
+        ``reset(options={"cart_x": 0.3, "block_color": (0, 0, 90)})``.
 
     Version history:
         v0: first release.
@@ -91,11 +103,11 @@ class DynmapEnv(gym.Env):
         render_size: int = 256,
     ):
         if obs_type not in OBS_TYPES:
-            raise ValueError(f"unknown obs_type {obs_type!r}; choose from {OBS_TYPES}")
+            raise ValueError(f"obs_type must be one of {OBS_TYPES}, got {obs_type!r}")
         if control not in ACTION_LIMITS:
-            raise ValueError(f"unknown control {control!r}; choose from {sorted(ACTION_LIMITS)}")
+            raise ValueError(f"control must be one of {sorted(ACTION_LIMITS)}, got {control!r}")
         if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(f"unknown render_mode {render_mode!r}; choose human, rgb_array or None")
+            raise ValueError(f"render_mode must be human, rgb_array or None, got {render_mode!r}")
         self.task = get_task(task)
         self.task_description = self.task.description
         self.obs_type = obs_type
@@ -171,6 +183,6 @@ class DynmapEnv(gym.Env):
         }
 
 
-def agent_pos(world, task) -> np.ndarray:
-    """What a policy may know beside the frame, float32 ``[5]``: commanded cart pose and goal."""
+def agent_pos(world: World, task: Task) -> np.ndarray:
+    """Return what a policy may read besides the frame, float32 ``[5]``: commanded cart pose and goal (m, m, rad, m, m)."""
     return np.concatenate([world.commanded, task.goal(world)]).astype(np.float32)

@@ -1,4 +1,4 @@
-"""The world model as a TorchRL environment: policies act in what it predicts, with no simulator (paper, Sec. III-A)."""
+"""The world model as a TorchRL environment without a simulator (paper, Sec. III-A)."""
 
 from __future__ import annotations
 
@@ -9,43 +9,43 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import ModelBasedEnvBase
 
-from .world_model_transform import WorldModelTransform
 from dynmap_rl.modules.actor import MEMORY
 from dynmap_rl.modules.world_model import WorldModel
+
+from .world_model_transform import WorldModelTransform
 
 STEP_KEYS = ("latent", "predicted_latent", *MEMORY)
 
 
 class ImaginationEnv(ModelBasedEnvBase):
-    """A world model in open loop: the latent that it predicts is the next latent, and no frame is ever seen.
+    """World model in open loop: the predicted latent is the next latent, and no frame is encoded.
 
-    Every reset begins at ``start``; ``env.reset(other, set_state=True)`` begins once at another TensorDict of the
-    same keys. :func:`make_start` makes one from frames. Any TorchRL policy that reads ``latent``, ``hidden1``,
-    ``hidden2`` and ``goal`` acts in it, for example :class:`dynmap_rl.modules.LatentActor`. Gradients flow through the
-    steps unless they are switched off.
+    Every reset begins at ``start``. ``env.reset(other, set_state=True)`` begins once at another TensorDict with the
+    same keys. :func:`make_start` makes such a TensorDict from frames. Any TorchRL policy that reads ``latent``,
+    ``hidden1``, ``hidden2`` and ``goal`` can act in this environment, for example
+    :class:`dynmap_rl.modules.LatentActor`. Steps are differentiable.
 
-    Action: float32 ``[B, 3]``, dX, dY, dTheta (m, m, rad), within the limits of the simulated cart's speed.
+    Action: ``action`` float32 ``[B, A]``, in the range of the world model's own actions: dX, dY, dTheta (m, m, rad)
+    within the limits of the simulated cart.
 
-    Observations ``[B, ...]``: ``latent``, ``predicted_latent`` (equal but at the start), ``hidden1``, ``cell1``,
-    ``hidden2``, ``cell2``; ``("predicted_dynamics", quantity)`` (SI units) for what the world model decodes;
-    ``("reconstruction", "pixels")`` float32 in 0..1, with ``decode_pixels``; and what else ``start`` holds, such as
-    ``goal``, which stays as it is. Nothing is predicted for the first frame of an episode: where that is the start,
-    its dynamics and frame are decoded from zeros. Under other names, nested ones too, by TorchRL's ``RenameTransform``
-    (what is also read, such as ``latent``, in both directions).
+    Observation ``[B, ...]``: ``latent``, ``predicted_latent`` (equal except at the start), ``hidden1``, ``cell1``,
+    ``hidden2``, ``cell2``; ``("predicted_dynamics", quantity)`` (SI units) for each quantity that the world model
+    decodes; with ``decode_pixels`` ``("reconstruction", "pixels")``, float32 in 0..1; and all other entries of
+    ``start``, such as ``goal``, unchanged. There is no prediction of the first frame of an episode: at such a start
+    dynamics and frame are decoded from zeros. TorchRL's ``RenameTransform`` gives the keys other names.
 
-    The world model predicts no task reward and no end of an episode: ``reward`` is what the function given for it
-    makes of the observations, 0 without one, and ``done`` is never true. Give ``env.rollout`` a number of steps.
+    Reward and end: a world model predicts no reward and no end of an episode. ``reward`` is the value of the given
+    function, or 0 without one. ``done`` is always false, so ``env.rollout`` needs a number of steps.
 
     Args:
-        world_model: what predicts.
-        start: ``[B]`` with ``latent`` ``[B, Z]`` and, or else zeros, ``predicted_latent`` ``[B, Z]`` and the memory,
-            four times ``[B, H]``.
-        decode_pixels: decode a frame a step.
-        reward: a function of the observations after a step, a TensorDict ``[B]``, to float32 ``[B, 1]``: minus the
-            distance of ``("predicted_dynamics", "position")`` to ``goal``, say.
+        world_model: world model that predicts.
+        start: TensorDict ``[B]`` with ``latent`` ``[B, Z]``, and optionally ``predicted_latent`` ``[B, Z]`` and the
+            memory, four times ``[B, H]`` (default: zeros).
+        decode_pixels: decode a frame in each step.
+        reward: function from the observations after a step, a TensorDict ``[B]``, to a float32 reward ``[B, 1]``.
 
     Raises:
-        ValueError: ``start`` has not one batch axis, or no latents of the world model's size.
+        ValueError: ``start`` has more or less than one batch axis, or no latents of the world model's size.
     """
 
     batch_locked = True
@@ -71,7 +71,7 @@ class ImaginationEnv(ModelBasedEnvBase):
         self._make_specs()
 
     def _complete(self, start: TensorDictBase) -> TensorDict:
-        """All observations at the start."""
+        """Return all observations at a start."""
         td = TensorDict({}, self.batch_size, device=self.device).update(start.select(*self.constant))
         latent = start["latent"]
         values = (torch.zeros_like(latent), *self.world_model.initial_state(len(latent), latent.device))
@@ -121,20 +121,19 @@ class ImaginationEnv(ModelBasedEnvBase):
         return td
 
     def _set_seed(self, seed: int | None) -> None:
-        """Nothing is drawn at random."""
+        """Do nothing, as nothing is random."""
 
 
 def make_start(world_model: WorldModel, frames: TensorDictBase, mixed: bool = False) -> TensorDictBase:
-    """Where imagination begins: what the world model makes of the first frames of episodes, at the last of them.
+    """Make a start of :class:`ImaginationEnv` from the first frames of episodes, at the last of these frames.
 
     Args:
-        frames: ``[B, T]``, T >= 1, with ``pixels``, ``action`` (the last one is not used) and, optional, ``goal``.
+        world_model: world model that encodes the frames.
+        frames: ``[B, T]``, T >= 1, with ``pixels``, ``action`` (the last one is not used) and optionally ``goal``.
         mixed: encode in the precision of training.
 
     Returns:
-        ``[B]`` with ``latent``, ``predicted_latent``, the memory and the goal.
+        TensorDict ``[B]`` with ``latent``, ``predicted_latent``, the memory and the goal.
     """
-    seen = WorldModelTransform(world_model, mixed=mixed)(
-        frames.select("pixels", "action", "goal", strict=False)
-    )
-    return seen.exclude("pixels", "action")[:, -1]
+    frames = frames.select("pixels", "action", "goal", strict=False)
+    return WorldModelTransform(world_model, mixed=mixed)(frames).exclude("pixels", "action")[:, -1]

@@ -1,4 +1,4 @@
-"""Draws a world with pygame. The only place that knows pixels: 1 m x 1 m on ``size`` x ``size`` of them."""
+"""Drawing of worlds with pygame: 1 m x 1 m on ``size`` x ``size`` pixels."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import warnings
 import numpy as np
 
 from .geometry import Polygon
-from .tasks import BalanceReaching
+from .task import Task
 from .world import World
 
 os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
@@ -19,20 +19,16 @@ with warnings.catch_warnings():
     import pygame
 
 
-RGB = (
-    0xFF,
-    0xFF00,
-    0xFF0000,
-    0,
-)  # masks of a surface whose bytes are what a frame's are, so that none is converted
+RGB = 0xFF, 0xFF00, 0xFF0000, 0  # masks of a surface whose bytes are those of a frame
 
 
 class Renderer:
-    """Draws on a bare surface: no window, no audio, no display needed.
+    """Renderer on a bare surface: it opens no window and needs no display.
 
     Args:
         size: side of the frame in pixels.
-        supersample: draw so many times larger and average; 1 gives hard edges, as in the paper.
+        supersample: factor by which the picture is drawn larger and then averaged; 1 gives hard edges, as in the
+            paper.
     """
 
     def __init__(self, size: int = 64, supersample: int = 1):
@@ -41,8 +37,8 @@ class Renderer:
         self.canvas = pygame.Surface((self.scale, self.scale), 0, 24, RGB)
         self.frame = pygame.Surface((size, size), 0, 24, RGB) if supersample > 1 else self.canvas
 
-    def draw(self, world: World, task: BalanceReaching) -> np.ndarray:
-        """The frame, uint8 ``[size, size, 3]`` (height, width, RGB)."""
+    def draw(self, world: World, task: Task) -> np.ndarray:
+        """Draw the frame, uint8 ``[size, size, 3]`` (height, width, RGB)."""
         scene = world.scene
         self.canvas.fill(scene.background_color)
         for polygon, color in task.markers(scene):
@@ -52,9 +48,8 @@ class Renderer:
         self._fill(box(bx, by, bt, scene.block_width, scene.block_height), scene.block_color)
         if self.frame is not self.canvas:
             pygame.transform.smoothscale(self.canvas, (self.size, self.size), self.frame)
-        rows = np.frombuffer(self.frame.get_buffer(), dtype=np.uint8).reshape(
-            self.size, -1
-        )  # padded to 4 bytes
+        rows = np.frombuffer(self.frame.get_buffer(), dtype=np.uint8).reshape(self.size, -1)
+        # pygame pads rows to a multiple of 4 bytes.
         return rows[:, : 3 * self.size].reshape(self.size, self.size, 3).copy()
 
     def _fill(self, polygon: Polygon, color: tuple[int, int, int]) -> None:
@@ -63,11 +58,11 @@ class Renderer:
 
 
 class Window:
-    """A window on the screen that shows frames, in real time.
+    """Window on the screen that shows frames in real time.
 
     Args:
         size: side in pixels.
-        fps: the most frames a second; ``show`` waits for it.
+        fps: largest number of frames per second; ``show`` waits accordingly.
     """
 
     def __init__(self, size: int, fps: float):
@@ -77,9 +72,9 @@ class Window:
         self.clock, self.fps = pygame.time.Clock(), fps
 
     def show(self, frame: np.ndarray) -> None:
-        """uint8 ``[size, size, 3]``."""
+        """Show a frame, uint8 ``[size, size, 3]``."""
         self.screen.blit(pygame.image.frombuffer(frame, frame.shape[1::-1], "RGB"), (0, 0))
-        pygame.event.pump()  # or the system takes the window for one that hangs
+        pygame.event.pump()  # otherwise the system reports a window that does not respond
         pygame.display.flip()
         self.clock.tick(self.fps)
 
@@ -89,7 +84,7 @@ class Window:
 
 
 def box(x: float, y: float, angle: float, width: float, height: float) -> Polygon:
-    """The corners of a rotated rectangle about its centre (m)."""
+    """Return the corners of a rectangle (m) that is rotated about its centre by ``angle`` (rad)."""
     c, s = math.cos(angle) / 2, math.sin(angle) / 2
     wx, wy, hx, hy = c * width, s * width, -s * height, c * height
     return [

@@ -1,4 +1,4 @@
-"""What varies from episode to episode: the scene, the ranges it is drawn from, and the seeds (paper, Sec. IV-B)."""
+"""Scenes, the ranges from which they are drawn, and their seeds (paper, Sec. IV-B)."""
 
 from __future__ import annotations
 
@@ -20,9 +20,12 @@ SEEDS_PER_SPLIT = 100_000_000
 
 @dataclass(frozen=True)
 class Scene:
-    """One episode's start: sizes and positions in m, colours in 0..255, density in kg/m^2.
+    """Start of an episode: sizes and positions (m), colours (0..255), density (kg/m^2).
 
     ``cart_x, cart_y`` is the cart's centre, ``block_shift`` the block's offset from it along the cart.
+
+    Raises:
+        ValueError: a size or the density is not positive, or the block's centre is beside the cart.
     """
 
     cart_width: float = 0.25
@@ -43,32 +46,42 @@ class Scene:
     def __post_init__(self):
         for f in fields(self):
             if f.name.endswith(SIZES) and not getattr(self, f.name) > 0:
-                raise ValueError(f"scene: {f.name} must be positive, got {getattr(self, f.name)}")
+                raise ValueError(f"{f.name} of the scene must be positive, got {getattr(self, f.name)}")
         if 2 * abs(self.block_shift) > self.cart_width:
-            raise ValueError(f"scene: block_shift {self.block_shift} puts the block's centre beside the cart")
+            half = self.cart_width / 2
+            raise ValueError(
+                f"block_shift must be within +-{half}, half the cart's width, got {self.block_shift}"
+            )
 
     def to_dict(self) -> dict:
-        """All factors by their names, for JSON."""
+        """Return all factors by their names, for JSON."""
         return asdict(self)
 
     @classmethod
     def from_dict(cls, values: Mapping) -> Scene:
-        """A scene from its factors by name; the others have their defaults."""
+        """Make a scene from factors by their names; the others have their defaults.
+
+        Raises:
+            ValueError: a factor is unknown or impossible.
+        """
         return cls().replace(**values)
 
     def replace(self, **values) -> Scene:
-        """A copy with some factors fixed; unknown names raise ``ValueError``."""
+        """Return a copy with some factors replaced.
+
+        Raises:
+            ValueError: a factor is unknown or impossible.
+        """
         unknown = set(values) - {f.name for f in fields(self)}
         if unknown:
-            raise ValueError(
-                f"scene: unknown factor {sorted(unknown)}; known are {[f.name for f in fields(self)]}"
-            )
+            known = [f.name for f in fields(self)]
+            raise ValueError(f"factors of the scene must be among {known}, got {sorted(unknown)}")
         return replace(self, **{k: tuple(v) if k.endswith("color") else v for k, v in values.items()})
 
 
 @dataclass(frozen=True)
 class ObstacleScene(Scene):
-    """Task 2: a vertical obstacle, given by its middle and its length."""
+    """Scene of task 2: a vertical obstacle, given by its middle and its length."""
 
     obstacle_x: float = 0.5
     obstacle_y: float = 0.38
@@ -77,7 +90,7 @@ class ObstacleScene(Scene):
 
 @dataclass(frozen=True)
 class BinScene(Scene):
-    """Task 3: a bin, whose opening has its middle at the goal, with its inner width and depth."""
+    """Scene of task 3: a bin with its inner width and depth; the middle of its opening is the goal."""
 
     goal_y: float = 0.2
     bin_width: float = 0.28
@@ -86,11 +99,14 @@ class BinScene(Scene):
 
 @dataclass(frozen=True)
 class SceneRanges:
-    """The uniform ranges a scene is drawn from; narrow or widen any of them.
+    """Uniform ranges from which a scene is drawn (units as in :class:`Scene`).
 
-    Start and goal are at least ``min_distance`` apart, so that no start is already solved. Objects are darker
-    than the background, and cart and block differ by ``min_contrast`` (Euclidean, 0..441), so that nothing
-    is invisible.
+    Start and goal are at least ``min_distance`` (m) apart, so that no episode starts as a success. By default objects
+    are darker than the background. The colours of cart and block differ by at least ``min_contrast`` (Euclidean
+    distance, 0..441), so that both are visible.
+
+    Attributes:
+        scene: class of the scenes that are drawn. A subclass with more factors has a range for each.
     """
 
     cart_width: Range = (0.20, 0.30)
@@ -114,7 +130,7 @@ class SceneRanges:
 
 @dataclass(frozen=True)
 class ObstacleRanges(SceneRanges):
-    """Task 2: the obstacle stands in the centre of where cart and goal can be; the way under it is closed."""
+    """Ranges of task 2: the obstacle stands in the centre of starts and goals, too low to pass under it."""
 
     obstacle_x: Range = (0.5, 0.5)
     obstacle_y: Range = (0.38, 0.38)
@@ -125,7 +141,7 @@ class ObstacleRanges(SceneRanges):
 
 @dataclass(frozen=True)
 class BinRanges(SceneRanges):
-    """Task 3: the cart starts above the bin's opening."""
+    """Ranges of task 3: the cart starts above the bin's opening."""
 
     cart_y: Range = (0.45, 0.68)
     goal_x: Range = (0.2, 0.8)
@@ -137,7 +153,11 @@ class BinRanges(SceneRanges):
 
 
 def sample_scene(rng: np.random.Generator, ranges: SceneRanges | None = None) -> Scene:
-    """Draw a scene. The same generator state gives the same scene."""
+    """Draw a scene; the same state of the generator gives the same scene.
+
+    Raises:
+        ValueError: 1,000 draws held no start far enough from the goal, or no colours different enough.
+    """
     r = ranges or SceneRanges()
     for _ in range(1000):
         factors = {
@@ -149,7 +169,7 @@ def sample_scene(rng: np.random.Generator, ranges: SceneRanges | None = None) ->
         if distance >= r.min_distance:
             break
     else:
-        raise ValueError(f"scene: the ranges hold no start {r.min_distance} m from the goal; widen them")
+        raise ValueError(f"the ranges must hold a start {r.min_distance} m from a goal; widen them")
     return r.scene(**factors, **_sample_colors(rng, r))
 
 
@@ -162,26 +182,30 @@ def _sample_colors(rng: np.random.Generator, r: SceneRanges) -> dict[str, Color]
         cart, block = color(*r.object_color), color(*r.object_color)
         if np.linalg.norm(np.subtract(cart, block)) >= r.min_contrast:
             return {"cart_color": cart, "block_color": block, "background_color": background}
-    raise ValueError(f"scene: no two object colours differ by {r.min_contrast}; lower min_contrast")
+    raise ValueError(f"object_color must hold colours that differ by {r.min_contrast}; lower min_contrast")
 
 
 def scene_seed(split: str, index: int) -> int:
-    """The seed of scene ``index`` of a split. Splits never share a seed.
+    """Return the seed of scene ``index`` of a split. Splits never share a seed.
 
     Raises:
-        ValueError: for an unknown split or an index outside it.
+        ValueError: the split is unknown, or the index is not in 0..99,999,999.
     """
     if split not in SPLITS:
-        raise ValueError(f"unknown split {split!r}; choose from {sorted(SPLITS)}")
+        raise ValueError(f"the split must be one of {sorted(SPLITS)}, got {split!r}")
     if not 0 <= index < SEEDS_PER_SPLIT:
-        raise ValueError(f"scene index {index} is outside 0..{SEEDS_PER_SPLIT - 1}")
+        raise ValueError(f"the scene index must be in 0..{SEEDS_PER_SPLIT - 1}, got {index}")
     return SPLITS[split] * SEEDS_PER_SPLIT + index
 
 
 def choose_ranges(own: SceneRanges, ranges: SceneRanges | None) -> SceneRanges:
-    """The ranges themselves, or a task's ``own`` for None; ``ValueError`` for those of scenes that lack what it needs."""
+    """Return ``ranges``, or a task's ``own`` ones for None.
+
+    Raises:
+        ValueError: scenes of ``ranges`` lack factors of the task.
+    """
     if ranges is None:
         return own
     if not issubclass(ranges.scene, own.scene):
-        raise ValueError(f"the task needs {type(own).__name__}, not {type(ranges).__name__}")
+        raise ValueError(f"ranges must be {type(own).__name__} in this task, got {type(ranges).__name__}")
     return ranges

@@ -1,4 +1,4 @@
-"""The tasks as one batched TorchRL environment: many worlds, one process, no wrapper around each."""
+"""The tasks as one batched TorchRL environment: many worlds in one process."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
+
+from dynmap_rl.keys import DYNAMICS
 
 from .gym_env import ACTION_LIMITS
 from .renderer import Renderer
@@ -23,26 +25,36 @@ EVENTS = ("dropped", "touched", "is_success")
 class DynmapBatchedEnv(EnvBase):
     """``num_envs`` worlds of a task as a TorchRL environment of batch size ``[num_envs]``.
 
-    The same seeds and actions give the same trajectories as the Gymnasium ids, with any ``num_envs``.
+    The class :class:`dynmap_rl.envs.DynmapEnv` specifies actions, rewards, success and the end of an episode. The same
+    seeds and actions give the same trajectories as the Gymnasium ids, with any ``num_envs``. The environment does not
+    reset worlds by itself; as in all of TorchRL, a rollout or a collector does.
 
-    Observation keys: ``state`` ``[N, S]`` (privileged), ``agent_pos`` ``[N, 5]``, ``goal`` ``[N, 2]``,
-    ``("dynamics", "position" | "velocity" | "acceleration")`` ``[N, 6]`` (SI units), ``dropped``, ``touched``,
-    ``is_success`` ``[N, 1]``, ``position_error`` ``[N, 1]`` (m), and ``pixels`` uint8 ``[N, 3, 64, 64]`` with ``from_pixels``.
+    Action: ``action`` float32 ``[N, 3]`` (SI units, see ``control``).
 
-    A reset draws each world's scene from the environment's seed, or, where the reset TensorDict has an entry
-    ``scene_seed`` ``[N]`` (int64), from that: ``env.reset(TensorDict(scene_seed=torch.arange(n), batch_size=[n]))``.
-    A ``TransformedEnv`` hands on no such entry, but arguments: ``env.reset(scene_seed=torch.arange(n))``. A
-    ``ParallelEnv`` of several hands on only arguments for each: ``env.reset(list_of_kwargs=[{"scene_seed": ...}, ...])``.
+    Observation: ``agent_pos`` ``[N, 5]`` (commanded cart pose x, y, theta and the goal; m, m, rad, m, m), ``goal``
+    ``[N, 2]`` (m), ``dropped``, ``touched`` and ``is_success`` bool ``[N, 1]``, ``position_error`` ``[N, 1]`` (m).
+    With ``include_state`` also the privileged ``state`` ``[N, S]`` and
+    ``("dynamics", "position" | "velocity" | "acceleration")`` ``[N, 6]`` (SI units; cart x, y, theta, block x, y,
+    theta). With ``from_pixels`` also ``pixels`` uint8 ``[N, 3, 64, 64]``.
+
+    Reset: scenes are drawn from the environment's seed. ``env.reset(scene_seed=torch.arange(n))`` gives each world the
+    scene of a seed of its own instead, as does an entry ``scene_seed`` ``[N]`` (int64) of the TensorDict that is
+    passed to ``reset``. A ``TransformedEnv`` forwards the argument but not the entry; a ``ParallelEnv`` forwards
+    ``env.reset(list_of_kwargs=[{"scene_seed": ...}, ...])``, one for each process.
 
     Args:
-        task: name of the task, or ``"module:Class"`` of your own.
+        task: name of the task, or ``"module:Class"`` of your own (see :class:`dynmap_rl.envs.Task`).
         num_envs: number of worlds N.
-        from_pixels: draw a frame a step.
-        control: ``position`` or ``acceleration`` (see ``DynmapEnv``).
-        ranges: what scenes are drawn from; by default the task's own.
-        seed: of the scenes.
-        pixels_only: leave ``state`` out, which takes time to compute and no policy on pixels may see.
-        threads: among which worlds are divided, which changes no bit; by default as many as torch then has.
+        from_pixels: draw a frame in each step.
+        control: ``position`` or ``acceleration`` (see :class:`dynmap_rl.envs.DynmapEnv`).
+        ranges: ranges from which scenes are drawn; by default the task's own.
+        seed: seed of the scenes.
+        device: device of the TensorDicts; worlds are simulated on the CPU.
+        include_state: include the privileged ``state`` and ``dynamics``. Without them no policy can read them, and
+            steps are faster.
+
+    Raises:
+        ValueError: ``num_envs``, ``task``, ``control`` or ``ranges`` is not valid.
     """
 
     batch_locked = True
@@ -56,22 +68,18 @@ class DynmapBatchedEnv(EnvBase):
         ranges: SceneRanges | None = None,
         seed: int | None = None,
         device: torch.device | str = "cpu",
-        pixels_only: bool = False,
-        threads: int | None = None,
+        include_state: bool = True,
     ):
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
         if control not in ACTION_LIMITS:
-            raise ValueError(f"unknown control {control!r}; choose from {sorted(ACTION_LIMITS)}")
-        if pixels_only and not from_pixels:
-            raise ValueError("pixels_only needs from_pixels: nothing would be observed")
+            raise ValueError(f"control must be one of {sorted(ACTION_LIMITS)}, got {control!r}")
         super().__init__(device=device, batch_size=[num_envs])
         self.task = get_task(task)
         self.control = control
         self.ranges = choose_ranges(self.task.ranges, ranges)
         self.renderer = Renderer() if from_pixels else None
-        self.pixels_only = pixels_only
-        self.threads = threads
+        self.include_state = include_state
         self.worlds: list[World | None] = [None] * num_envs
         self._make_specs()
         self.set_seed(seed)
@@ -82,16 +90,16 @@ class DynmapBatchedEnv(EnvBase):
         def unbounded(*shape, dtype=torch.float32):
             return Unbounded((n, *shape), dtype=dtype, device=device)
 
-        dynamics = {name: unbounded(6) for name in ("position", "velocity", "acceleration")}
         observation = {
             "agent_pos": unbounded(5),
-            "goal": unbounded(len(self.task.goal(self.task.make_world(_any_scene(self))))),
-            "dynamics": Composite(dynamics, shape=(n,), device=device),
+            "goal": unbounded(2),
             "position_error": unbounded(1),
             **{name: Binary(1, (n, 1), dtype=torch.bool, device=device) for name in EVENTS},
         }
-        if not self.pixels_only:
+        if self.include_state:
             observation["state"] = unbounded(self.task.state_size)
+            dynamics = {quantity: unbounded(6) for quantity in DYNAMICS}
+            observation["dynamics"] = Composite(dynamics, shape=(n,), device=device)
         if self.renderer:
             observation["pixels"] = Bounded(0, 255, (n, 3, 64, 64), dtype=torch.uint8, device=device)
         self.observation_spec = Composite(observation, shape=(n,), device=device)
@@ -121,51 +129,59 @@ class DynmapBatchedEnv(EnvBase):
             seeds = tensordict.get("scene_seed", scene_seed)
         if seeds is not None and (shape := tuple(np.shape(seeds))) != (n,):
             raise ValueError(
-                f"scene_seed must have one seed for each of {n} worlds, not {shape}; "
-                "a ParallelEnv takes those of its processes as list_of_kwargs"
+                f"scene_seed must have shape ({n},), one seed for each world, got {shape}; "
+                "pass those of a ParallelEnv as list_of_kwargs"
             )
         rows = mask.nonzero().flatten().tolist()
         for i in rows:
             seed = int(seeds[i]) if seeds is not None else int(self.rng.integers(2**63))
             scene = self.task.sample_scene(np.random.default_rng(seed), self.ranges)
             self.worlds[i] = self.task.make_world(scene)
-        # What was last seen is kept apart from what callers get, who may change it.
+        # Callers may change what they get, so the last observation is kept apart.
         if len(rows) == n:
-            self._seen = self._observe(self.worlds)
+            self._observation = self._observe(self.worlds)
         elif rows:
-            self._seen[mask.to(self.device)] = self._observe([self.worlds[i] for i in rows])
-        return self._seen.clone()
+            self._observation[mask.to(self.device)] = self._observe([self.worlds[i] for i in rows])
+        return self._observation.clone()
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         actions = tensordict["action"].detach().cpu().numpy()
         if self.control == "acceleration":
             actions = [world.action_for(a) for world, a in zip(self.worlds, actions, strict=True)]
-        step_worlds(self.worlds, actions, self.threads or torch.get_num_threads())
-        self._seen = self._observe(self.worlds)
+        step_worlds(self.worlds, actions)
+        self._observation = self._observe(self.worlds)
         reward = torch.tensor([[self.task.reward(world)] for world in self.worlds], dtype=torch.float32)
-        return self._seen.clone().set("reward", reward.to(self.device))
+        return self._observation.clone().set("reward", reward.to(self.device))
+
+    def read_dynamics(self) -> TensorDict:
+        """Read the dynamics of all worlds from the simulator, for measurements.
+
+        Returns:
+            TensorDict ``[N]`` with ``position``, ``velocity`` and ``acceleration`` ``[N, 6]`` (SI units; cart x, y,
+            theta, block x, y, theta), the same values as the observation ``dynamics`` has with ``include_state``.
+        """
+        return TensorDict(_read_dynamics(self.worlds), self.batch_size, device=self.device)
 
     def _observe(self, worlds: list[World]) -> TensorDict:
-        """What is to be seen of some of the worlds, and which of them are done."""
+        """Return observations and done flags of some of the worlds."""
         task = self.task
-        # Entries are columns of few arrays, as many small arrays take longer.
-        vectors = ((w.commanded, task.goal(w), w.position, w.velocity, w.acceleration) for w in worlds)
-        rows = _rows(itertools.chain.from_iterable(vectors), len(worlds))
+        agent_pos = _stack(
+            itertools.chain.from_iterable((w.commanded, task.goal(w)) for w in worlds), len(worlds)
+        )
         flags = np.array([self._flags(w) for w in worlds], dtype=bool)
         flags = dict(
             zip((*EVENTS, "terminated", "truncated"), torch.from_numpy(flags).split(1, 1), strict=True)
         )
-        dynamics = zip(("position", "velocity", "acceleration"), rows[:, -18:].split(6, 1), strict=True)
         data = {
-            "agent_pos": rows[:, :-18],
-            "goal": rows[:, 3:-18],
-            "dynamics": dict(dynamics),
+            "agent_pos": agent_pos,
+            "goal": agent_pos[:, 3:],
             "position_error": torch.tensor([[w.position_error] for w in worlds], dtype=torch.float32),
             "done": flags["terminated"] | flags["truncated"],
             **flags,
         }
-        if not self.pixels_only:
-            data["state"] = _rows((task.state(w) for w in worlds), len(worlds))
+        if self.include_state:
+            data["state"] = _stack((task.state(w) for w in worlds), len(worlds))
+            data["dynamics"] = _read_dynamics(worlds)
         if self.renderer:
             frames = np.stack([self.renderer.draw(w, task) for w in worlds])
             data["pixels"] = torch.from_numpy(frames).permute(0, 3, 1, 2)
@@ -177,11 +193,12 @@ class DynmapBatchedEnv(EnvBase):
         return world.dropped, bool(world.touched), task.is_success(world), *ended
 
 
-def _rows(vectors: Iterable[np.ndarray], count: int) -> torch.Tensor:
-    """Vectors, one after the other, as float32 ``[count, ...]``; three times as fast as ``np.stack``."""
+def _read_dynamics(worlds: list[World]) -> dict[str, torch.Tensor]:
+    vectors = itertools.chain.from_iterable((w.position, w.velocity, w.acceleration) for w in worlds)
+    return dict(zip(DYNAMICS, _stack(vectors, len(worlds)).split(6, 1), strict=True))
+
+
+def _stack(vectors: Iterable[np.ndarray], count: int) -> torch.Tensor:
+    """Return ``count`` rows of consecutive vectors as one float32 array; three times as fast as ``np.stack``."""
     array = np.concatenate(list(vectors), dtype=np.float32, casting="same_kind")
     return torch.from_numpy(array.reshape(count, -1))
-
-
-def _any_scene(env: DynmapBatchedEnv):
-    return env.task.sample_scene(np.random.default_rng(0), env.ranges)

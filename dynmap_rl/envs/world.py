@@ -1,4 +1,4 @@
-"""The simulated world: a position-controlled cart that carries a free-standing block (paper, Sec. IV).
+"""Simulation of a position-controlled cart that carries a free-standing block (paper, Sec. IV).
 
 Plain Python and PyMunk. SI units: m, s, rad, kg. Gravity points along -y.
 """
@@ -12,23 +12,23 @@ import numpy as np
 import pymunk
 
 from .scene import Point, Scene
-from .substeps import choose_run, read_bodies
+from .substeps import read_bodies, run_substeps
 
 GRAVITY = 9.81  # m/s^2
 CONTROL_DT = 0.05  # s, 20 Hz
 SUBSTEPS = 50  # of 1 ms each
 EPISODE_STEPS = 120
-FINAL_STEPS = 10  # the position error is a mean over the last 10 steps
+FINAL_STEPS = 10  # over which the position error is a mean
 
-# The limits of the cart, for experts and students alike, per axis (x, y, theta).
+# Limits of the cart per axis (x, y, theta), the same for experts and policies.
 VELOCITY_LIMIT = np.array([0.4, 0.4, 1.0])  # m/s, m/s, rad/s
 ACCELERATION_LIMIT = np.array([3.0, 3.0, 10.0])  # m/s^2, m/s^2, rad/s^2
 WORKSPACE_LOW = np.array([0.05, 0.03, -math.pi / 3])  # m, m, rad
 WORKSPACE_HIGH = np.array([0.95, 0.95, math.pi / 3])
 ACTION_LIMIT = VELOCITY_LIMIT * CONTROL_DT  # the largest change of the commanded pose in one control step
-LARGEST_CHANGE = ACCELERATION_LIMIT * CONTROL_DT**2  # of an action, from one control step to the next
+LARGEST_CHANGE = ACCELERATION_LIMIT * CONTROL_DT**2  # between the actions of two consecutive control steps
 
-GROUND = -0.25  # m, where a dropped block comes to lie, below the picture
+GROUND = -0.25  # m, height at which a dropped block comes to rest, below the picture
 DROP_TILT = math.pi / 4  # rad, relative to the cart
 WALL_RADIUS = 0.01  # m, half the thickness of a wall
 
@@ -37,30 +37,27 @@ CART, BLOCK, WALL = 1, 2, 3  # PyMunk collision types
 
 
 class World:
-    """Cart and block of one scene, and walls that do not move.
+    """Cart and block of one scene, and fixed walls.
 
-    The block collides with walls; the cart, which follows its command whatever comes, goes through them. Both are
-    noticed.
+    Walls stop the block. The cart follows its command in any case and passes through them. Both contacts are recorded
+    in ``touched``.
 
     Args:
         scene: sizes and start.
-        walls: the ends of each, 20 mm thick and rounded.
-
-    Arrays hold cart x, y, theta, block x, y, theta, in this order, ``[6]`` float64:
+        walls: the two ends of each wall (m); walls are 20 mm thick and rounded.
 
     Attributes:
-        position, velocity: read from PyMunk.
-        acceleration: ``(velocity_t - velocity_{t-1}) / CONTROL_DT``, zero at the start.
-        block_in_cart: the block's pose in the cart's frame: x, y (m) from the cart's centre, and angle (rad).
-        commanded: ``[3]`` commanded cart pose, the start pose plus the sum of all actions.
-        action: ``[3]`` the last action as executed, after the limits.
-        goal: ``[2]`` where the cart shall go.
-        steps: control steps so far.
-        dropped: the block is, or once was, no longer carried: it leaned over by more than 45 degrees relative
-            to the cart, its centre sank below half its standing height over the cart's top, or it moved beyond
-            the cart's edge.
-        touched: which of ``"cart"`` and ``"block"`` touches, or once touched, a wall.
-        errors: distance of cart and goal after every control step, the start first (m).
+        position, velocity, acceleration: cart x, y, theta, block x, y, theta, each float64 ``[6]`` (SI units). The
+            acceleration is ``(velocity_t - velocity_{t-1}) / CONTROL_DT``, zero at the start.
+        block_in_cart: pose of the block in the cart's frame: x, y (m) from the cart's centre, and angle (rad).
+        commanded: commanded cart pose ``[3]``, the start pose plus the sum of all actions.
+        action: last action ``[3]`` as it was executed, within the limits.
+        goal: goal of the cart's centre ``[2]`` (m).
+        steps: number of control steps so far.
+        dropped: whether the block was ever not carried: it leaned over by more than 45 degrees relative to the cart,
+            its centre was below half its standing height over the cart's top, or it was beyond the cart's edge.
+        touched: which of ``"cart"`` and ``"block"`` ever touched a wall.
+        errors: distances of cart and goal (m), at the start and after each control step.
     """
 
     def __init__(self, scene: Scene, walls: Sequence[Wall] = ()):
@@ -122,15 +119,18 @@ class World:
         self.space.on_collision(BLOCK, WALL, begin=lambda *_: touched.add("block"))
 
     def step(self, action: np.ndarray) -> None:
-        """One control step of 50 ms with the position-update action ``(dX, dY, dTheta)`` (m, m, rad).
+        """Simulate one control step of 50 ms with the position-update action ``(dX, dY, dTheta)`` (m, m, rad).
 
         The change of the commanded pose becomes a constant acceleration by the second difference of commanded
         positions, ``(a_t - a_{t-1}) / CONTROL_DT**2``, within the limits (paper, Sec. IV-A).
+
+        Raises:
+            ValueError: the action is not 3 finite numbers.
         """
         step_worlds([self], [action])
 
     def _finish(self, action: np.ndarray, bodies: np.ndarray) -> None:
-        """Note where the simulation of an action has led: positions and velocities, ``[12]``."""
+        """Record an executed action, and positions and velocities ``[12]`` of the bodies after it."""
         velocity = bodies[6:]
         self.action = action
         self.commanded = self.commanded + action
@@ -143,11 +143,11 @@ class World:
         self.errors.append(self.goal_distance)
 
     def accelerate(self, acceleration: np.ndarray) -> None:
-        """One control step at a constant cart acceleration (m/s^2, m/s^2, rad/s^2), the expert's interface."""
+        """Simulate one control step at a constant acceleration of the cart (m/s^2, m/s^2, rad/s^2)."""
         self.step(self.action_for(acceleration))
 
     def action_for(self, acceleration: np.ndarray) -> np.ndarray:
-        """The position-update action that gives this cart acceleration from the present state."""
+        """Return the position-update action that gives this acceleration of the cart in the next step."""
         return self.action + np.asarray(acceleration, dtype=np.float64) * CONTROL_DT**2
 
     def _locate_block(self) -> tuple[float, float, float]:
@@ -174,36 +174,52 @@ class World:
         return sum(last) / len(last)
 
 
-def step_worlds(worlds: Sequence[World], actions: Sequence[np.ndarray], threads: int = 1) -> None:
-    """:meth:`World.step` of every world at once, which is faster than one after the other and gives the same bits, with
-    any number of threads."""
+def step_worlds(worlds: Sequence[World], actions: Sequence[np.ndarray]) -> None:
+    """Simulate one control step of each world (see :meth:`World.step`).
+
+    This is faster than one world after the other and gives the same bits.
+
+    Args:
+        worlds: N worlds.
+        actions: one action (m, m, rad) for each world.
+
+    Raises:
+        ValueError: an action is not 3 finite numbers.
+    """
     last = np.array([world.action for world in worlds])
     limited = _limit(actions, last, np.array([world.commanded for world in worlds]))
     limited = limited.astype(np.float32).astype(np.float64)  # as stored, so that a replay is bit-exact
-    found = simulate(worlds, last / CONTROL_DT, limited / CONTROL_DT, threads)
+    found = simulate(worlds, last / CONTROL_DT, limited / CONTROL_DT)
     for world, action, bodies in zip(worlds, limited, found, strict=True):
         world._finish(action, bodies)
 
 
-def simulate(worlds: Sequence[World], before: np.ndarray, after: np.ndarray, threads: int = 1) -> np.ndarray:
-    """50 steps of 1 ms while the carts' velocities ``[N, 3]`` go linearly from ``before`` to ``after``; positions and
-    velocities of the bodies, ``[N, 12]``."""
-    # The velocity in the middle of each substep: the cart's path is then the exact parabola.
+def simulate(worlds: Sequence[World], before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Simulate 50 substeps of 1 ms, in which the carts' velocities go linearly from ``before`` to ``after``.
+
+    Args:
+        worlds: N worlds.
+        before: velocities of the carts at the start, ``[N, 3]`` (m/s, m/s, rad/s).
+        after: velocities of the carts at the end, ``[N, 3]``.
+
+    Returns:
+        Positions and velocities of the bodies after the control step, ``[N, 12]`` (SI units).
+    """
     bodies = [(world.space, world.cart, world.block) for world in worlds]
-    return choose_run()(bodies, before, after, SUBSTEPS, CONTROL_DT / SUBSTEPS, threads)
+    return run_substeps(bodies, before, after, SUBSTEPS, CONTROL_DT / SUBSTEPS)
 
 
-# Of the speed from which a cart stops within its room back and forth, braking at the limit in whole control steps.
+# For the largest speed from which a cart can brake at the limit, in whole control steps, before the workspace ends.
 WAYS, EDGES = np.array([[[1.0]], [[-1.0]]]), np.stack([-WORKSPACE_LOW, WORKSPACE_HIGH])[:, None]
 HALF_BRAKE, TWICE = ACCELERATION_LIMIT * CONTROL_DT / 2, 2 * ACCELERATION_LIMIT
 HALF_SQUARED = HALF_BRAKE**2
 
 
 def _limit(actions: Sequence[np.ndarray], last: np.ndarray, commanded: np.ndarray) -> np.ndarray:
-    """The actions ``[N, 3]`` that the carts can execute: limits of acceleration, of speed, and room left to brake."""
+    """Return the actions ``[N, 3]`` that the carts can execute, within limits of acceleration, speed and workspace."""
     wanted = np.array(actions, dtype=np.float64)
     if wanted.shape != last.shape or not np.isfinite(wanted).all():
-        raise ValueError(f"an action is 3 finite numbers (dX, dY, dTheta), got {wanted}")
+        raise ValueError(f"an action must be 3 finite numbers (dX, dY, dTheta), got {wanted}")
     room = np.maximum(WAYS * commanded + EDGES, 0.0)  # [2, N, 3]
     speed = np.sqrt(HALF_SQUARED + TWICE * room) - HALF_BRAKE
     back, forth = np.minimum(speed, VELOCITY_LIMIT) * CONTROL_DT

@@ -1,4 +1,4 @@
-"""A frozen world model as a TorchRL environment transform: what policies read, for any TorchRL algorithm."""
+"""A frozen world model as a TorchRL transform, which adds the latents that policies read."""
 
 from __future__ import annotations
 
@@ -13,25 +13,27 @@ from dynmap_rl.modules.world_model import WorldModel
 
 
 class WorldModelTransform(Transform):
-    """Appends a world model's latents and hidden states to an environment of frames (paper, Sec. III).
+    """Transform that adds latents and hidden states of a frozen world model to an environment with frames.
 
-    At t it writes ``latent``, the encoded frame, and ``predicted_latent``, ``hidden1``, ``cell1``, ``hidden2``,
-    ``cell2``: what the world model says about t from all frames and actions before. The memory goes from step to
-    step through the TensorDict, so that the transform itself has no state, and is zero in every world that is reset.
-    The world model is frozen: nothing has a gradient.
+    At t it writes ``latent``, the encoded frame (paper, Sec. III), and ``predicted_latent``, ``hidden1``, ``cell1``,
+    ``hidden2``, ``cell2``, the world model's prediction of t from all earlier frames and actions. The memory passes
+    from step to step through the TensorDict: the transform itself has no state. The memory is zero in every world that
+    is reset. Nothing has a gradient.
 
-    In a replay buffer, or called on a TensorDict ``[B, T]``, it writes the same for whole windows; where the
-    TensorDict has ``is_init`` ``[B, T, 1]``, memory is zero wherever that is true, otherwise at t = 0.
+    In a replay buffer, or called on a TensorDict ``[B, T]``, the transform writes the same for whole windows. Memory
+    is then zero wherever ``is_init`` ``[B, T, 1]`` is true, or at t = 0 if the TensorDict has no ``is_init``.
 
     Args:
-        world_model: what encodes and predicts.
-        pixels, action: keys that are read, ``[..., 3, 64, 64]`` and ``[..., A]`` (SI units).
-        latent, predicted_latent: keys that are written, ``[..., Z]``.
-        memory: keys of the memory, which are written and read back, four times ``[..., H]``.
+        world_model: world model that encodes and predicts.
+        pixels: key of the frames ``[..., 3, 64, 64]``, which is read.
+        action: key of the actions ``[..., A]`` (SI units), which is read.
+        latent: key of the latent ``[..., Z]``, which is written.
+        predicted_latent: key of the predicted latent ``[..., Z]``, which is written.
+        memory: keys of the memory, four times ``[..., H]``, which are written and read back.
         is_init: key of the flag where an episode begins, read in windows only.
-        agent_pos: where given, the key of the commanded cart pose x, y, theta (its first A entries). Its change
-            is then the action in the place of ``action``: what the cart did, after its limits, also in an environment
-            whose actions are accelerations. World models are trained on such actions. Windows need the key
+        agent_pos: if given, key of the commanded cart pose x, y, theta (its first A entries). The change of this
+            entry takes the place of ``action``. It is the action that the cart executed within its limits, on which
+            world models are trained, also in an environment whose actions are accelerations. Windows need the key
             under ``next``, too.
         mixed: encode in the precision of training (see :meth:`dynmap_rl.modules.WorldModel.encode`).
     """
@@ -54,7 +56,7 @@ class WorldModelTransform(Transform):
 
     @torch.no_grad()
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        # TorchRL keeps the old entries of the worlds that are not reset: theirs need no encoding here.
+        # TorchRL keeps the old entries of the worlds that are not reset, so these need no encoding.
         batch = tensordict_reset.batch_size
         mask = tensordict.get("_reset", torch.ones(batch, dtype=torch.bool)).reshape(batch)
         pixels = tensordict_reset[self.in_keys[0]]
@@ -65,16 +67,19 @@ class WorldModelTransform(Transform):
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         latent, _, *memory = (tensordict[key] for key in self.out_keys)
-        after = self.world_model.step(latent, self._taken(tensordict, next_tensordict), tuple(memory))
+        after = self.world_model.step(
+            latent, self._executed_action(tensordict, next_tensordict), tuple(memory)
+        )
         latent = self.world_model.encode(next_tensordict[self.in_keys[0]], self.mixed)
         return self._write(next_tensordict, latent, after[0], *after[1])
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         if tensordict.ndim != 2:
-            raise ValueError(f"outside of an environment windows [B, T] are needed, not {tensordict.shape}")
+            shape = tuple(tensordict.shape)
+            raise ValueError(f"outside of an environment the TensorDict must be windows [B, T], got {shape}")
         latent = self.world_model.encode(tensordict[self.in_keys[0]], self.mixed)  # (B, T, Z)
-        action = self._taken(tensordict, tensordict.get("next", TensorDict()))
+        action = self._executed_action(tensordict, tensordict.get("next", TensorDict()))
         begins = tensordict.get(self.is_init, None)
         states = (torch.zeros_like(latent[:, 0]), *self.world_model.initial_state(len(latent), latent.device))
         steps = []
@@ -86,7 +91,7 @@ class WorldModelTransform(Transform):
             states = (predicted, *memory)
         return self._write(tensordict, latent, *(torch.stack(x, 1) for x in zip(*steps, strict=True)))
 
-    def _taken(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> torch.Tensor:
+    def _executed_action(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> torch.Tensor:
         if self.agent_pos is None:
             return tensordict[self.action]
         change = next_tensordict[self.agent_pos] - tensordict[self.agent_pos]
@@ -107,7 +112,7 @@ class WorldModelTransform(Transform):
         return observation_spec
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
-        """What a step reads beside the action, so that processes of their own get it too."""
+        """Add the entries that a step reads besides the action, so that worlds in other processes get them."""
         state_spec = input_spec["full_state_spec"]
         if state_spec is None:
             state_spec = Composite(shape=input_spec.shape, device=input_spec.device)

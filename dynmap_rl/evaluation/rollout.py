@@ -1,4 +1,4 @@
-"""Closed-loop evaluation: all episodes as one batch (paper, Sec. V-B)."""
+"""Closed-loop rollouts: all episodes as one batch (paper, Sec. V-B)."""
 
 from __future__ import annotations
 
@@ -14,9 +14,11 @@ from dynmap_rl.envs.scene import scene_seed
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.envs.world import EPISODE_STEPS
 
+EVENTS = tuple(("next", key) for key in ("position_error", "dropped", "touched", "is_success"))
+
 
 def scene_seeds(split: str, count: int, start: int = 0) -> list[int]:
-    """The seeds of scenes ``start .. start + count`` of a split."""
+    """Return the seeds of the scenes ``start`` to ``start + count - 1`` of a split."""
     return [scene_seed(split, start + i) for i in range(count)]
 
 
@@ -24,54 +26,54 @@ def scene_seeds(split: str, count: int, start: int = 0) -> list[int]:
 def roll_out(
     actor: TensorDictModuleBase, task: str, seeds: list[int], keep_pixels: bool = False
 ) -> TensorDict:
-    """Run one episode of 120 steps for each scene seed, to the end also where the block is dropped.
+    """Run one episode of 120 steps for each scene; an episode goes on after the block is dropped.
 
     Args:
-        actor: reads ``pixels``, ``goal`` or ``agent_pos`` and writes ``action``, as a :class:`dynmap_rl.modules.Actor`
+        actor: reads ``pixels``, ``goal`` or ``agent_pos`` and writes ``action``, as :class:`dynmap_rl.modules.Actor`
             does.
-        task: its name.
-        seeds: of the scenes.
-        keep_pixels: whether frames are in the result.
+        task: name of the task.
+        seeds: seeds of the scenes.
+        keep_pixels: keep the frames in the result.
 
     Returns:
-        A TensorDict ``[E, 120]`` with the environment's entries at t (``dynamics``, ``action``, ``goal``, ...;
-        ``pixels`` only where kept) and ``("next", "position_error" | "dropped" | "touched" | "is_success")``; with a world model
-        that decodes dynamics, also ``("predicted_dynamics", quantity)`` at t, its one-step prediction along
-        these rollouts (zeros at t = 0).
+        A TensorDict ``[E, 120]`` with ``action``, ``goal`` and ``dynamics`` at t, ``pixels`` if they are kept, and
+        ``("next", "position_error" | "dropped" | "touched" | "is_success")``. ``("predicted_dynamics", quantity)`` is the
+        one-step prediction of the actor's world model at t, zero at t = 0, for each quantity that it decodes.
     """
     actor = actor.eval()
-    if hasattr(actor, "reset"):  # of LeRobot's policies, whose memory is their own
+    if hasattr(actor, "reset"):  # a LeRobot policy keeps its memory itself
         actor.reset()
-    device = next(actor.parameters()).device
-    env = DynmapBatchedEnv(task, len(seeds), from_pixels=True, pixels_only=True, device=device)
-    td = env.reset(TensorDict({"scene_seed": torch.tensor(seeds)}, [len(seeds)]))
-    keys = [
-        "action",
-        "goal",
-        "dynamics",
-        *(("next", k) for k in ("position_error", "dropped", "touched", "is_success")),
-    ]
-    keys += ["pixels"] if keep_pixels else []
-    steps = []
+    device, count = next(actor.parameters()).device, len(seeds)
+    env = DynmapBatchedEnv(task, count, from_pixels=True, include_state=False, device=device)
+    td = env.reset(TensorDict({"scene_seed": torch.tensor(seeds)}, [count]))
+    keys = ["action", "goal", *EVENTS, *(["pixels"] if keep_pixels else [])]
     world_model = getattr(actor, "world_model", None)
     quantities = world_model.supervision if world_model else ()
-    predicted = {quantity: torch.zeros(len(seeds), 6, device=device) for quantity in quantities}
-    for _ in tqdm(range(EPISODE_STEPS), f"{len(seeds)} episodes", unit="step", leave=False):
+    predicted = {quantity: torch.zeros(count, 6, device=device) for quantity in quantities}
+    steps = []
+    for _ in tqdm(range(EPISODE_STEPS), f"{count} episodes", unit="step", leave=False):
+        dynamics = env.read_dynamics()
         td = env.step(actor(td))
-        step = td.select(*keys)
-        step["predicted_dynamics"] = TensorDict(predicted, [len(seeds)])
-        steps.append(step)
+        step = td.select(*keys).set("dynamics", dynamics)
+        steps.append(step.set("predicted_dynamics", TensorDict(predicted, [count])))
         td = step_mdp(td, keep_other=False)
         if quantities:
-            states = td["predicted_latent"], td["hidden1"], td["hidden2"]
-            predicted = world_model.decode_dynamics(*states)
+            predicted = world_model.decode_dynamics(td["predicted_latent"], td["hidden1"], td["hidden2"])
     return torch.stack(steps, 1).cpu()
 
 
 def episode_rows(episodes: TensorDict, seeds: list[int]) -> list[dict]:
-    """One JSON-ready row an episode: scene seed, dropped, touched a wall, position error (m), success, and, where the world model
-    decodes positions, the mean distance between predicted and true cart position (m), in all steps and in those
-    more than 0.1 m away from the goal."""
+    """Return one JSON-ready row an episode.
+
+    Args:
+        episodes: result of :func:`roll_out`.
+        seeds: seeds of its scenes.
+
+    Returns:
+        Rows with ``scene_seed``, ``dropped``, ``touched`` (the cart touched a wall), ``position_error`` (m) and
+        ``success``. If the world model decodes positions, ``localization_error`` is the mean distance between predicted
+        and true cart position (m), and ``localization_error_away`` its mean over the steps more than 0.1 m from the goal.
+    """
     last = episodes["next"][:, -1]
     rows = [
         {
@@ -95,8 +97,8 @@ def episode_rows(episodes: TensorDict, seeds: list[int]) -> list[dict]:
 
 
 def failures_first(seeds: Sequence[int], success: Sequence[bool], count: int = 8) -> list[int]:
-    """``count`` of the scene seeds to look at: failures, then successes, half of each where there are as many."""
+    """Return ``count`` scene seeds, failures first; half of them are failures if there are enough of both."""
     pairs = list(zip(seeds, success, strict=True))
-    failed, others = ([seed for seed, good in pairs if good == wanted] for wanted in (False, True))
+    failed, others = ([seed for seed, good in pairs if good == expected] for expected in (False, True))
     failed = failed[: max(count // 2, count - len(others))]
     return failed + others[: count - len(failed)]

@@ -12,7 +12,8 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor
 
-from dynmap_rl.envs.tasks import BalanceReaching, get_task
+from dynmap_rl.envs.task import Task
+from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.world import EPISODE_STEPS, World, step_worlds
 from dynmap_rl.utils.files import read_json
 from dynmap_rl.utils.weights import load_module
@@ -55,9 +56,9 @@ def make_actor(network: ExpertNetwork) -> ProbabilisticActor:
 @torch.no_grad()
 def play(
     network: ExpertNetwork,
-    task: BalanceReaching,
+    task: Task,
     scene_seeds: Sequence[int],
-    states: BalanceReaching | None = None,
+    states: Task | None = None,
 ) -> Iterator[list[World]]:
     """Yield the worlds before each of the 120 steps of the mean action; afterwards they are in their final state.
 
@@ -73,14 +74,14 @@ def play(
         state = np.stack([(states or task).state(world) for world in worlds])
         mean, _ = network(torch.from_numpy(state))
         actions = [world.action_for(a) for world, a in zip(worlds, mean.numpy(), strict=True)]
-        step_worlds(worlds, actions, torch.get_num_threads())
+        step_worlds(worlds, actions)
 
 
 def roll_out(
     network: ExpertNetwork,
-    task: BalanceReaching,
+    task: Task,
     scene_seeds: Sequence[int],
-    states: BalanceReaching | None = None,
+    states: Task | None = None,
 ) -> list[World]:
     """Play episodes to the end (see :func:`play`) and return the worlds."""
     [worlds] = deque(play(network, task, scene_seeds, states), maxlen=1)
@@ -129,7 +130,7 @@ def load_expert(expert: str | Path, checkpoint: str | None = None) -> ExpertNetw
     return load_module(folder / f"{checkpoint}.safetensors", make).eval().requires_grad_(False)
 
 
-def task_of_expert(expert: str | Path, task: BalanceReaching) -> BalanceReaching:
+def task_of_expert(expert: str | Path, task: Task) -> Task:
     """Return the task whose ``state`` an expert was trained on.
 
     Args:

@@ -4,14 +4,10 @@ import numpy as np
 import pygame
 import pytest
 
-from dynmap_rl.envs.renderer import Renderer
-from dynmap_rl.envs.renderer import box
-from dynmap_rl.envs.scene import GOAL_COLOR
-from dynmap_rl.envs.scene import Scene
-from dynmap_rl.envs.tasks import TASKS
-from dynmap_rl.envs.tasks import get_task
-from dynmap_rl.envs.world import WALL
-from dynmap_rl.envs.world import World
+from dynmap_rl.envs.renderer import Renderer, box
+from dynmap_rl.envs.scene import GOAL_COLOR, Scene
+from dynmap_rl.envs.tasks import TASKS, get_task
+from dynmap_rl.envs.world import WALL, World
 
 TASK = get_task("balance_reaching")
 SCENE = Scene(cart_x=0.3, cart_y=0.3, goal_x=0.8, goal_y=0.7)
@@ -46,11 +42,10 @@ def test_background_and_three_flat_colours_with_markers_in_green(name):
 
 
 @pytest.mark.parametrize("name", ["balance_reaching_obstacle", "bin_dropping"])
-@pytest.mark.parametrize("seed", range(3))
-def test_walls_are_drawn_where_they_stand(name, seed):
+def test_walls_are_drawn_where_they_stand(name):
     """Green is what lies in a wall of the world; a pixel's width is left open."""
-    task, size = get_task(name), 256
-    scene = task.sample_scene(np.random.default_rng(seed)).replace(cart_x=0.12, cart_y=0.85, goal_x=0.8)
+    task, size = get_task(name), 192
+    scene = task.sample_scene(np.random.default_rng(0)).replace(cart_x=0.12, cart_y=0.85, goal_x=0.8)
     world = task.make_world(scene)
     walls = [s for s in world.space.static_body.shapes if s.collision_type == WALL]
     green = (Renderer(size).draw(world, task) == GOAL_COLOR).all(-1)
@@ -65,7 +60,7 @@ def test_walls_are_drawn_where_they_stand(name, seed):
         rows, columns = np.indices(green.shape)
         goal = np.hypot(columns / size - scene.goal_x, 1 - rows / size - scene.goal_y) < 0.04
         outside &= ~goal
-    assert inside.sum() > 50
+    assert inside.sum() > 20
     assert green[inside].all()
     assert not green[outside].any()
 

@@ -6,16 +6,18 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from dynmap_rl.envs.scene import SEEDS_PER_SPLIT
-from dynmap_rl.envs.scene import SPLITS
-from dynmap_rl.envs.scene import BinRanges
-from dynmap_rl.envs.scene import BinScene
-from dynmap_rl.envs.scene import ObstacleRanges
-from dynmap_rl.envs.scene import ObstacleScene
-from dynmap_rl.envs.scene import Scene
-from dynmap_rl.envs.scene import SceneRanges
-from dynmap_rl.envs.scene import sample_scene
-from dynmap_rl.envs.scene import scene_seed
+from dynmap_rl.envs.scene import (
+    SEEDS_PER_SPLIT,
+    SPLITS,
+    BinRanges,
+    BinScene,
+    ObstacleRanges,
+    ObstacleScene,
+    Scene,
+    SceneRanges,
+    sample_scene,
+    scene_seed,
+)
 
 every_kind = pytest.mark.parametrize("ranges", [SceneRanges(), ObstacleRanges(), BinRanges()])
 
@@ -106,7 +108,7 @@ def test_splits_never_share_a_seed():
 
 @pytest.mark.parametrize("split, index", [("nope", 0), ("test", -1), ("test", SEEDS_PER_SPLIT)])
 def test_unknown_split_or_index_raises(split, index):
-    with pytest.raises(ValueError, match="scene index|unknown split"):
+    with pytest.raises(ValueError, match="split|index"):
         scene_seed(split, index)
 
 

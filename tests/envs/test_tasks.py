@@ -1,4 +1,4 @@
-"""What holds for every task; and task 1: its reward, its success, and the state its experts see."""
+"""What holds for every task; and task 1."""
 
 import math
 
@@ -6,19 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.envs.gym_env import DynmapEnv
-from dynmap_rl.envs.scene import BinRanges
-from dynmap_rl.envs.scene import ObstacleRanges
-from dynmap_rl.envs.scene import Scene
-from dynmap_rl.envs.scene import SceneRanges
-from dynmap_rl.envs.scene import choose_ranges
-from dynmap_rl.envs.tasks import MARKER_SIZE
-from dynmap_rl.envs.tasks import TASKS
-from dynmap_rl.envs.tasks import get_task
-from dynmap_rl.envs.world import ACTION_LIMIT
-from dynmap_rl.envs.world import EPISODE_STEPS
-from dynmap_rl.envs.world import World
+from dynmap_rl.envs.scene import BinRanges, ObstacleRanges, Scene, SceneRanges, choose_ranges
+from dynmap_rl.envs.task import MARKER_SIZE
+from dynmap_rl.envs.tasks import TASKS, get_task
+from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
+from dynmap_rl.envs.world import ACTION_LIMIT, EPISODE_STEPS, World
 from dynmap_rl.experts.network import load_expert
 
 TASK = get_task("balance_reaching")
@@ -58,7 +51,7 @@ def test_reward_stays_in_its_range(task):
     """For wild actions, and for those of the expert, which come near the upper end."""
     rng, expert = np.random.default_rng(0), load_expert(task.name)
     rewards = []
-    for seed in range(6):
+    for seed in range(4):
         world = task.make_world(task.sample_scene(np.random.default_rng(seed)))
         for _ in range(EPISODE_STEPS):
             mean, _ = expert(torch.from_numpy(task.state(world)))
@@ -104,7 +97,7 @@ def test_policies_are_given_the_scenes_goal(task):
 
 @every_task
 def test_no_start_is_solved_or_lost(task):
-    for seed in range(100):
+    for seed in range(30):
         world = task.make_world(task.sample_scene(np.random.default_rng(seed)))
         for _ in range(2):
             assert not task.is_success(world) and not task.is_over(world)
@@ -123,7 +116,7 @@ def test_no_start_is_solved_or_lost(task):
     ],
 )
 def test_ranges_of_another_task_raise(make, task, ranges, needed):
-    with pytest.raises(ValueError, match=f"the task needs {needed}, not {type(ranges).__name__}"):
+    with pytest.raises(ValueError, match=f"{needed}.*got {type(ranges).__name__}"):
         make(task, ranges=ranges)
 
 

@@ -4,16 +4,18 @@ import numpy as np
 import pytest
 
 from dynmap_rl.envs.scene import Scene
-from dynmap_rl.envs.world import ACCELERATION_LIMIT
-from dynmap_rl.envs.world import ACTION_LIMIT
-from dynmap_rl.envs.world import CONTROL_DT
-from dynmap_rl.envs.world import EPISODE_STEPS
-from dynmap_rl.envs.world import GRAVITY
-from dynmap_rl.envs.world import VELOCITY_LIMIT
-from dynmap_rl.envs.world import WORKSPACE_HIGH
-from dynmap_rl.envs.world import WORKSPACE_LOW
-from dynmap_rl.envs.world import World
-from dynmap_rl.envs.world import simulate
+from dynmap_rl.envs.world import (
+    ACCELERATION_LIMIT,
+    ACTION_LIMIT,
+    CONTROL_DT,
+    EPISODE_STEPS,
+    GRAVITY,
+    VELOCITY_LIMIT,
+    WORKSPACE_HIGH,
+    WORKSPACE_LOW,
+    World,
+    simulate,
+)
 
 STILL = np.zeros(3)
 

@@ -5,9 +5,7 @@ import pytest
 from pymunk import Vec2d
 
 from dynmap_rl.envs.scene import Scene
-from dynmap_rl.envs.world import CONTROL_DT
-from dynmap_rl.envs.world import WALL_RADIUS
-from dynmap_rl.envs.world import World
+from dynmap_rl.envs.world import CONTROL_DT, WALL_RADIUS, World
 
 SCENE = Scene(cart_x=0.3, cart_y=0.2, cart_width=0.24, cart_height=0.04, block_height=0.16)
 CART_TOP, CART_FRONT = 0.22, 0.42

@@ -7,17 +7,12 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
+from dynmap_rl.envs.geometry import length, path_is_blocked, way_around
 from dynmap_rl.envs.gym_env import DynmapEnv
-from dynmap_rl.envs.geometry import length
-from dynmap_rl.envs.geometry import path_is_blocked
-from dynmap_rl.envs.geometry import way_around
-from dynmap_rl.envs.scene import ObstacleRanges
-from dynmap_rl.envs.scene import ObstacleScene
+from dynmap_rl.envs.scene import ObstacleRanges, ObstacleScene
 from dynmap_rl.envs.tasks import get_task
-from dynmap_rl.envs.world import CONTROL_DT
-from dynmap_rl.envs.world import EPISODE_STEPS
-from dynmap_rl.envs.world import World
+from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
+from dynmap_rl.envs.world import CONTROL_DT, EPISODE_STEPS, World
 
 TASK = get_task("balance_reaching_obstacle")
 BETWEEN = {"obstacle_x": 0.5, "obstacle_y": 0.5, "obstacle_length": 0.2}
@@ -127,7 +122,7 @@ def test_reward_of_moving_away_is_less_than_of_resting():
 def test_state_shows_a_way_that_leads_to_the_goal():
     """A cart that always goes where the first two numbers of its state point comes to the goal untouched."""
     blocked = 0
-    for seed in range(40):
+    for seed in range(16):
         scene = TASK.sample_scene(np.random.default_rng(seed))
         if not path_is_blocked(scene):
             continue
@@ -137,7 +132,7 @@ def test_state_shows_a_way_that_leads_to_the_goal():
             move(world, towards(world, world.position[:2] + TASK.state(world)[:2] / 2, speed=0.3))
         assert world.touched == set() and not world.dropped
         assert world.goal_distance < 0.02
-    assert blocked > 8
+    assert blocked > 3
 
 
 def test_state_tells_obstacle_and_length_of_the_way():

@@ -6,13 +6,12 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.envs.gym_env import DynmapEnv
 from dynmap_rl.envs.scene import BinScene
 from dynmap_rl.envs.substeps import read_bodies
 from dynmap_rl.envs.tasks import get_task
-from dynmap_rl.envs.world import GRAVITY
-from dynmap_rl.envs.world import World
+from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
+from dynmap_rl.envs.world import GRAVITY, World
 
 TASK = get_task("bin_dropping")
 SCENE = BinScene(cart_x=0.2, cart_y=0.6, goal_x=0.7, goal_y=0.2, bin_width=0.28, bin_depth=0.12)

@@ -1,0 +1,15 @@
+from .gym_env import DynmapEnv as DynmapEnv
+from .imagination import ImaginationEnv as ImaginationEnv
+from .imagination import make_start as make_start
+from .scene import Scene as Scene
+from .scene import SceneRanges as SceneRanges
+from .scene import sample_scene as sample_scene
+from .scene import scene_seed as scene_seed
+from .task import Task as Task
+from .tasks import BalanceReaching as BalanceReaching
+from .tasks import BalanceReachingObstacle as BalanceReachingObstacle
+from .tasks import BinDropping as BinDropping
+from .tasks import get_task as get_task
+from .torchrl_env import DynmapBatchedEnv as DynmapBatchedEnv
+from .world import World as World
+from .world_model_transform import WorldModelTransform as WorldModelTransform
