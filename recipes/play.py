@@ -1,41 +1,40 @@
-"""Play a task, watch an expert or a policy at it, look into its world model, record demonstrations of your own.
+"""Play a task, watch an expert or a policy, look into a world model, record demonstrations of a person.
 
     python recipes/play.py --task bin_dropping
     python recipes/play.py --policy balance_reaching    # ships with the package; or a run folder
     python recipes/play.py --policy balance_reaching --imagine_from 20 --steps 120 --gif play.gif
     python recipes/play.py --record datasets/mine
 
-Arrows or WASD move the cart, Q and E tilt it, a pressed mouse button calls it; TAB changes who drives: you, the expert
-or the policy. With a policy the window shows what its world model predicts, one step ahead or, in imagination (I), on
-and on without frames, beside the simulator. B shows the dynamics of cart or block, R takes the next scene, SPACE
-pauses, ESC ends.
+Arrows or WASD move the cart, Q and E tilt it, a pressed mouse button calls it; TAB changes the driver: hand, expert or
+policy. With a policy, the window also shows the world model's prediction, one step ahead or, in imagination (I), without
+frames. B changes between cart and block in the traces, R takes the next scene, SPACE pauses, ESC ends.
 
-With --record, every successful episode that you alone drove is kept at once; at the end they become a LeRobot dataset with
-dynamics columns, shown on a page in runs/play, and the next session adds to it.
+With --record, every successful episode that the hand alone drove is kept at once. At the end, the episodes become a
+LeRobot dataset with a page in runs/play; the next session adds to it.
 """
 
-import dataclasses
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynmap_rl.utils.cli import run_recipe
+from dynmap_rl.utils.cli import command_line, run_recipe
 
 
-@dataclass
+@dataclass(frozen=True)
 class Config:
-    # Name of the task: balance_reaching, balance_reaching_obstacle, bin_dropping, or module:Class of your own; by
-    # default the one that the policy was trained on, otherwise balance_reaching.
+    """Settings of the recipe."""
+
+    # Task: balance_reaching, balance_reaching_obstacle, bin_dropping, or module:Class; by default the policy's.
     task: str | None = None
-    # Run folder of ours with world model and policy, its id on the hub, or balance_reaching, which ships with the
-    # package.
+    # Run with world model and policy: a folder, a hub id, or balance_reaching (shipped).
     policy: str | None = None
-    # Which of the run's policies.
+    # Seed of the run's policy.
     seed: int = 0
-    # Expert: the name of the task that it ships for, or a folder of checkpoints; by default the task's own.
+    # Expert: a task whose expert ships, or a folder of checkpoints; by default the task's own.
     expert: str | None = None
-    # From this step of every episode on the world model goes on without frames, as if I were pressed; with a policy.
+    # Step of every episode from which the world model continues without frames, as if I were pressed.
     imagine_from: int | None = None
-    # Who drives at first: hand, expert or policy; by default the policy where there is one.
+    # First driver: hand, expert or policy; by default the policy where there is one.
     driver: str | None = None
     # Number of the first scene.
     scene: int = 0
@@ -45,40 +44,38 @@ class Config:
     push_to_hub: str | None = None
     # Side of the scene on the screen, in pixels.
     size: int = 384
-    # End after so many steps (for films).
+    # Number of steps after which the window closes.
     steps: int | None = None
-    # An animation of the window, as a GIF.
+    # File of an animation of the window (GIF); needs --steps.
     gif: Path | None = None
 
 
 def main(config: Config) -> None:
+    """Play, record and upload."""
     from dynmap_rl.data.format.hub import push_dataset
-    from dynmap_rl.data.recording.human import list_shards
-    from dynmap_rl.data.recording.human import next_scene
-    from dynmap_rl.data.recording.human import open_folder
-    from dynmap_rl.data.recording.human import publish_episodes
+    from dynmap_rl.data.recording.human import list_shards, next_scene, open_folder, publish_episodes
     from dynmap_rl.envs.tasks import get_task
-    from dynmap_rl.envs.world import CONTROL_DT
-    from dynmap_rl.envs.world import EPISODE_STEPS
-    from dynmap_rl.reporting.dataset_page import write_dataset_page
-    from dynmap_rl.runs.lookup import find_run
-    from dynmap_rl.runs.lookup import load_actor
-    from dynmap_rl.runs.lookup import task_of_run
-    from dynmap_rl.play.window import PlayWindow
+    from dynmap_rl.envs.world import CONTROL_DT, EPISODE_STEPS
     from dynmap_rl.play.session import Session
+    from dynmap_rl.play.window import PlayWindow
+    from dynmap_rl.reporting.dataset_page import write_dataset_page
+    from dynmap_rl.runs.folder import plain_settings
+    from dynmap_rl.runs.lookup import find_run, load_actor, task_of_run
 
     run = find_run(config.policy) if config.policy else None
     task = config.task or (run and task_of_run(run)) or "balance_reaching"
     actor = load_actor(run, config.seed) if run else None
     get_task(task, from_file=not config.task)
     if config.size < 64 or (config.steps is not None and config.steps < 1):
-        raise ValueError("--size must be at least 64 and --steps at least 1")
+        raise ValueError(
+            f"--size must be at least 64 and --steps at least 1, got {config.size} and {config.steps}"
+        )
     if config.imagine_from is not None and not (actor and 1 <= config.imagine_from < EPISODE_STEPS):
         raise ValueError(
-            f"--imagine_from is a step of 1 to {EPISODE_STEPS - 1}, and needs --policy, whose world model imagines"
+            f"--imagine_from must be a step of 1 to {EPISODE_STEPS - 1}, with --policy, got {config.imagine_from}"
         )
     if config.gif and not config.steps:
-        raise ValueError("--gif needs --steps, the number of steps that the film shows")
+        raise ValueError("--gif needs --steps, the length of the animation")
     if config.push_to_hub and not config.record:
         raise ValueError("--push_to_hub needs --record, the folder of the demonstrations")
     kept, first = 0, config.scene
@@ -89,7 +86,7 @@ def main(config: Config) -> None:
     session = Session(task, actor, config.expert, first, split="train" if config.record else "validation")
     if config.driver:
         if config.driver not in session.drivers:
-            raise ValueError(f"--driver is one of {', '.join(session.drivers)}, not {config.driver!r}")
+            raise ValueError(f"--driver must be one of {', '.join(session.drivers)}, got {config.driver!r}")
         session.driver = config.driver
     window, frames = PlayWindow(session, config.size), []
     try:
@@ -100,7 +97,7 @@ def main(config: Config) -> None:
         if count > max(kept, 1) or (count > 1 and not config.record.exists()):
             print(f"{count} episodes: {publish_episodes(config.record, task)}")
             folder = Path("runs/play") / config.record.name
-            write_dataset_page(folder, config.record, dataclasses.asdict(config))
+            write_dataset_page(folder, config.record, plain_settings(config), command_line(sys.argv))
     if config.gif:
         save_film(frames, config.gif)
     if config.push_to_hub:
@@ -113,7 +110,7 @@ def main(config: Config) -> None:
 
 
 def play(config: Config, task: str, session, window, frames: list, dt: float) -> None:
-    """Until the window is closed, or for a number of steps."""
+    """Play until the window is closed, or for a number of steps."""
     from dynmap_rl.data.recording.human import keep_episode
     from dynmap_rl.envs.renderer import pygame
 
@@ -144,7 +141,7 @@ def play(config: Config, task: str, session, window, frames: list, dt: float) ->
 
 
 def save_film(frames: list, path: Path) -> None:
-    """One picture in two, at half size, in real time, all with the same 128 colours, or they would flicker."""
+    """Write every other picture at half size, all with the same 128 colours, against flicker."""
     import numpy as np
     from PIL import Image
 
@@ -159,4 +156,4 @@ def save_film(frames: list, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    run_recipe(main, Config)
+    run_recipe(main, Config, sys.argv)

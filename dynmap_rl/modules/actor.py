@@ -1,4 +1,4 @@
-"""World model and policies as TensorDict modules, with the keys of the project as defaults."""
+"""World model and policy as TensorDict modules, one time step a call, and their sequence forms."""
 
 from __future__ import annotations
 
@@ -27,15 +27,20 @@ def make_world_model_module(
     latent: NestedKey = "latent",
     predicted: tuple[NestedKey, NestedKey, NestedKey] = PREDICTED,
 ) -> TensorDictSequential:
-    """The sequence form: ``pixels``, ``action`` ``[B, T]`` to ``latent``, ``predicted_latent``, ``hidden1``,
-    ``hidden2``, the reconstruction and ``(predicted_dynamics, quantity)``, all at their own time t.
+    """Make the sequence form of a world model, from ``[B, T]`` to ``[B, T]``.
 
-    There is no prediction for t = 0: what stands there was decoded from zeros.
+    It reads ``pixels`` and ``action`` and writes ``latent``, ``predicted_latent``, ``hidden1``, ``hidden2``, the
+    reconstruction and ``(predicted_dynamics, quantity)``, each at its own time t. There is no prediction for t = 0:
+    reconstruction and dynamics are decoded from zeros there.
 
     Args:
-        pixels, action: keys that are read.
-        reconstruction, predicted_dynamics, latent: keys that are written.
-        predicted: keys of predicted latent and the two hidden states, which are written.
+        world_model: encoder, transition and decoders.
+        pixels: key that is read.
+        action: key that is read.
+        reconstruction: key that is written.
+        predicted_dynamics: prefix of the keys that are written.
+        latent: key that is written.
+        predicted: keys of the predicted latent and of the two hidden states, which are written.
     """
     predicted = list(predicted)
     modules = [
@@ -55,29 +60,34 @@ def make_policy_module(
     action: NestedKey = "action",
     states: tuple[NestedKey, NestedKey, NestedKey] = STATES,
 ) -> TensorDictModule:
-    """The sequence form of a policy: ``latent``, ``hidden1``, ``hidden2`` and ``goal`` ``[B, T]`` to ``action``.
+    """Make the sequence form of a policy: ``latent``, ``hidden1``, ``hidden2``, ``goal`` ``[B, T]`` to ``action``.
 
     Args:
-        states: keys of latent and the two hidden states.
+        policy: feed-forward or recurrent.
+        goal: key that is read.
+        action: key that is written.
+        states: keys of the latent and of the two hidden states, which are read.
     """
     return TensorDictModule(policy, [*states, goal], [action])
 
 
 class LatentActor(TensorDictModuleBase):
-    """A policy on latents and hidden states that are there already, one time step a call.
+    """Policy that acts on latents and hidden states, one time step a call.
 
-    For environments that give them: those with a :class:`dynmap_rl.envs.WorldModelTransform`, and
-    :class:`dynmap_rl.envs.ImaginationEnv`. Reads ``latent``, ``hidden1``, ``hidden2``, ``goal`` and the policy's own
-    memory at t, writes ``action`` at t and, under ``next``, the memory at t + 1. Memory is zero where it is absent
-    and where ``is_init`` (optional, ``[..., 1]``) says that an episode begins.
+    For environments that provide these states: those with a :class:`dynmap_rl.envs.WorldModelTransform`, and
+    :class:`dynmap_rl.envs.ImaginationEnv`. It reads ``latent``, ``hidden1``, ``hidden2``, ``goal`` and the policy's own
+    memory at t; it writes ``action`` at t and, under ``next``, the memory at t + 1. The memory is zero where it is
+    absent and where ``is_init`` (optional, ``[..., 1]``) is true.
 
-    In ``env.rollout`` or a collector, append :meth:`make_tensordict_primer` and ``InitTracker`` to the environment,
-    where the policy is recurrent.
+    In ``env.rollout`` or a collector, a recurrent policy needs :meth:`make_tensordict_primer` and ``InitTracker`` as
+    transforms of the environment.
 
     Args:
-        policy: what acts.
-        states: keys of latent and the two hidden states.
-        goal, action, is_init: keys.
+        policy: feed-forward or recurrent.
+        states: keys of the latent and of the two hidden states.
+        goal: key that is read.
+        action: key that is written.
+        is_init: key that is read.
         policy_memory: keys of a recurrent policy's memory.
     """
 
@@ -97,10 +107,11 @@ class LatentActor(TensorDictModuleBase):
         self.out_keys = [unravel_key(action), *(unravel_key(("next", k)) for k in self.policy_memory)]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action and the next memory."""
         return self.act(tensordict, *(tensordict[key] for key in self.states))
 
     def act(self, tensordict: TensorDictBase, latent, hidden1, hidden2) -> TensorDictBase:
-        """The same, for states that are not in the TensorDict."""
+        """Act on states ``[..., Z]`` and ``[..., H]`` that are not in the TensorDict."""
         state = None
         if self.policy_memory:
             sizes = dict.fromkeys(self.policy_memory, self.policy.lstm.hidden_size)
@@ -111,7 +122,7 @@ class LatentActor(TensorDictModuleBase):
         return tensordict
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
-        """The transform that gives an environment the policy's memory, zero at every reset."""
+        """Make the transform that gives an environment the policy's memory, zero at every reset."""
         size = self.policy.lstm.hidden_size if self.policy_memory else 0
         return _make_primer(dict.fromkeys(self.policy_memory, size))
 
@@ -119,18 +130,29 @@ class LatentActor(TensorDictModuleBase):
 class Actor(TensorDictModuleBase):
     """World model and policy as one recurrent TensorDict policy, one time step a call.
 
-    Reads ``pixels`` ``[..., 3, 64, 64]``, ``goal`` ``[..., G]`` and the memories at t, writes ``action`` ``[..., A]``
-    and ``latent`` at t and, under ``next``, the memories and ``predicted_latent`` at t + 1. Memories are zero where
-    they are absent and where ``is_init`` (optional, ``[..., 1]``) says that an episode begins.
+    A call is three steps, which can also be called one by one, for example to execute another action than the
+    policy's: :meth:`observe` writes ``latent`` from ``pixels``; :meth:`act` writes ``action`` and the policy's next
+    memory; :meth:`predict` writes ``predicted_latent`` and the world model's next memory from ``action``. Where the
+    TensorDict has no ``pixels``, the predicted latent takes the frame's place: the actor imagines.
+
+    It reads ``pixels`` ``[..., 3, 64, 64]``, ``goal`` ``[..., G]`` and the memories at t; it writes ``action``
+    ``[..., A]`` and ``latent`` at t and, under ``next``, the memories and ``predicted_latent`` at t + 1. Memories are
+    zero where they are absent and where ``is_init`` (optional, ``[..., 1]``) is true.
 
     In ``env.rollout`` or a collector, append :meth:`make_tensordict_primer` and ``InitTracker`` to the environment.
 
     Args:
-        world_model, policy: what acts.
-        pixels, goal, action, is_init: keys.
+        world_model: encoder and transition.
+        policy: feed-forward or recurrent.
+        pixels: key that is read.
+        goal: key that is read.
+        action: key that is written.
+        is_init: key that is read.
         mixed: encode frames in the precision of training (see :meth:`WorldModel.encode`), as recipes do.
-        latent, predicted_latent: keys that are written.
-        memory, policy_memory: keys of the world model's memory and of a recurrent policy's, four each.
+        latent: key that is written.
+        predicted_latent: key that is written and, in imagination, read.
+        memory: four keys of the world model's memory.
+        policy_memory: four keys of a recurrent policy's memory.
     """
 
     def __init__(
@@ -164,18 +186,38 @@ class Actor(TensorDictModuleBase):
         return self.latent_actor.policy
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        pixels = tensordict[self.pixels]
-        sizes = dict.fromkeys(self.memory, self.world_model.hidden_size)
-        state = _recall(tensordict, sizes, self.is_init, pixels.device)
-        latent = self.world_model.encode(pixels, self.mixed)
-        tensordict.set(self.latent, latent)
-        self.latent_actor.act(tensordict, latent, state[0], state[2])
-        predicted, state = self.world_model.step(latent, tensordict[self.action], state)
+        """Observe, act and predict."""
+        return self.predict(self.act(self.observe(tensordict)))
+
+    def observe(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``latent``: the encoded frame or, without a frame, the predicted latent.
+
+        Raises:
+            KeyError: there is neither a frame nor a predicted latent.
+        """
+        pixels = tensordict.get(self.pixels, None)
+        if pixels is None:
+            return tensordict.set(self.latent, tensordict[self.predicted_latent])
+        return tensordict.set(self.latent, self.world_model.encode(pixels, self.mixed))
+
+    def act(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the policy's ``action`` and its next memory."""
+        latent, state = tensordict[self.latent], self._recall(tensordict)
+        return self.latent_actor.act(tensordict, latent, state[0], state[2])
+
+    def predict(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the predicted latent and the world model's memory of the next step, from ``latent`` and ``action``."""
+        state = self._recall(tensordict)
+        predicted, state = self.world_model.step(tensordict[self.latent], tensordict[self.action], state)
         _remember(tensordict, (self.predicted_latent, *self.memory), (predicted, *state))
         return tensordict
 
+    def _recall(self, tensordict: TensorDictBase) -> tuple[torch.Tensor, ...]:
+        sizes = dict.fromkeys(self.memory, self.world_model.hidden_size)
+        return _recall(tensordict, sizes, self.is_init, tensordict[self.latent].device)
+
     def make_tensordict_primer(self) -> TensorDictPrimer:
-        """The transform that gives an environment the memories, zero at every reset."""
+        """Make the transform that gives an environment the memories, zero at every reset."""
         sizes = dict.fromkeys(self.memory, self.world_model.hidden_size)
         if self.latent_actor.policy_memory:
             sizes |= dict.fromkeys(self.latent_actor.policy_memory, self.policy.lstm.hidden_size)
@@ -183,7 +225,7 @@ class Actor(TensorDictModuleBase):
 
 
 def _recall(tensordict: TensorDictBase, sizes: dict, is_init: NestedKey, device) -> tuple[torch.Tensor, ...]:
-    """The entries of ``sizes``; zeros where they are absent and where an episode begins."""
+    """Return the entries of ``sizes``; zeros where they are absent and where an episode begins."""
     batch = tensordict.batch_size
     state = tuple(tensordict.get(k, torch.zeros(*batch, n, device=device)) for k, n in sizes.items())
     begins = tensordict.get(is_init, None)

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import torch
 
+from dynmap_rl.utils.files import read_json, write_json
+from dynmap_rl.utils.weights import load_module, save_weights
+
 from .normalization import Normalizer
 from .policy import FeedforwardPolicy, RecurrentPolicy
 from .world_model import WorldModel
-from dynmap_rl.utils.files import read_json, write_json
-from dynmap_rl.utils.weights import load_module, save_weights
 
 POLICIES = {"feedforward": FeedforwardPolicy, "recurrent": RecurrentPolicy}
 
@@ -18,7 +19,15 @@ POLICIES = {"feedforward": FeedforwardPolicy, "recurrent": RecurrentPolicy}
 def make_world_model(
     constants: dict, supervision: tuple[str, ...], latent_size=64, hidden_size=128, keypoints=False
 ) -> WorldModel:
-    """A fresh world model with a dataset's normalisation constants (``{name: {"low": [D], "high": [D]}}``)."""
+    """Make a world model with random weights.
+
+    Args:
+        constants: of the dataset's normalisation, ``{name: {"low": [D], "high": [D]}}``.
+        supervision: quantities that are decoded.
+        latent_size: Z.
+        hidden_size: H.
+        keypoints: see :class:`dynmap_rl.modules.Encoder`.
+    """
     dynamics = {q: Normalizer(**constants[q]) for q in supervision}
     return WorldModel(Normalizer(**constants["action"]), dynamics, latent_size, hidden_size, keypoints)
 
@@ -26,7 +35,17 @@ def make_world_model(
 def make_policy(
     constants: dict, kind: str, world_model: WorldModel, **arguments
 ) -> FeedforwardPolicy | RecurrentPolicy:
-    """A fresh policy of a kind, ``feedforward`` or ``recurrent``; ``arguments`` are its own (``width``, ...)."""
+    """Make a policy with random weights.
+
+    Args:
+        constants: of the dataset's normalisation, ``{name: {"low": [D], "high": [D]}}``.
+        kind: ``feedforward`` or ``recurrent``.
+        world_model: world model whose states the policy reads.
+        **arguments: arguments of the policy, such as ``width``.
+
+    Raises:
+        ValueError: the kind is unknown.
+    """
     check_policy(kind)
     sizes = world_model.latent_size, world_model.hidden_size
     action, goal = Normalizer(**constants["action"]), Normalizer(**constants["goal"])
@@ -34,13 +53,13 @@ def make_policy(
 
 
 def check_policy(kind: str) -> None:
-    """Raises ``ValueError`` for an unknown kind."""
+    """Raise ``ValueError`` for an unknown kind."""
     if str(kind) not in POLICIES:
-        raise ValueError(f"unknown policy {kind!r}; choose from {sorted(POLICIES)}")
+        raise ValueError(f"the kind of a policy must be one of {', '.join(sorted(POLICIES))}, got {kind!r}")
 
 
 def save_world_model(folder: Path, model: WorldModel) -> None:
-    """Write its weights, and its sizes as ``arguments.json``."""
+    """Write weights and sizes of a world model to a folder."""
     arguments = {
         "action": model.transition.action.size,
         "dynamics": {q: n.size for q, n in model.dynamics_decoder.normalizers.items()},
@@ -53,7 +72,11 @@ def save_world_model(folder: Path, model: WorldModel) -> None:
 
 
 def load_world_model(folder: Path) -> WorldModel:
-    """Raises ``ValueError`` where the folder holds no world model."""
+    """Load a world model, in evaluation mode.
+
+    Raises:
+        ValueError: the folder holds no world model, or a damaged one.
+    """
     arguments = _read_arguments(folder)
     if "dynamics" not in arguments:
         raise ValueError(f"{folder} holds a policy, not a world model")
@@ -66,7 +89,13 @@ def load_world_model(folder: Path) -> WorldModel:
 
 
 def save_policy(folder: Path, policy: FeedforwardPolicy | RecurrentPolicy, world_model: WorldModel) -> None:
-    """Write its weights, and its kind and sizes as ``arguments.json``; the world model is the one that it acts on."""
+    """Write weights, kind and sizes of a policy to a folder.
+
+    Args:
+        folder: gets ``weights.safetensors`` and ``arguments.json``.
+        policy: policy to save.
+        world_model: world model whose states the policy reads.
+    """
     recurrent = isinstance(policy, RecurrentPolicy)
     arguments = {
         "kind": "recurrent" if recurrent else "feedforward",
@@ -81,7 +110,11 @@ def save_policy(folder: Path, policy: FeedforwardPolicy | RecurrentPolicy, world
 
 
 def load_policy(folder: Path) -> FeedforwardPolicy | RecurrentPolicy:
-    """Raises ``ValueError`` where the folder holds no policy."""
+    """Load a policy, in evaluation mode.
+
+    Raises:
+        ValueError: the folder holds no policy, or a damaged one.
+    """
     arguments = _read_arguments(folder)
     if "kind" not in arguments:
         raise ValueError(f"{folder} holds a world model, not a policy")
@@ -102,5 +135,5 @@ def _read_arguments(folder: Path) -> dict:
 
 
 def _blank(size: int) -> Normalizer:
-    """A normaliser whose constants the weights will overwrite."""
+    """Make a normaliser whose constants the weights overwrite."""
     return Normalizer(-torch.ones(size), torch.ones(size))

@@ -14,13 +14,12 @@ from .layers import BLOCK, up
 from .normalization import Normalizer
 
 
-
 class ImageDecoder(nn.Module):
-    """``(z_hat_t, h1_t, h2_t)`` to a frame ``[..., 3, 64, 64]`` in 0..1.
+    """Plain CNN from predicted latents and hidden states to frames.
 
     Args:
         input_size: Z + 2 H.
-        channels: of the maps of stride 8 and 4.
+        channels: channels of the maps of stride 8 and 4.
     """
 
     def __init__(self, input_size: int, channels: tuple[int, int] = (64, 32)):
@@ -37,33 +36,34 @@ class ImageDecoder(nn.Module):
     def forward(
         self, predicted_latent: torch.Tensor, hidden1: torch.Tensor, hidden2: torch.Tensor
     ) -> torch.Tensor:
+        """Decode ``[..., Z]`` and ``[..., H]`` twice to frames ``[..., 3, 64, 64]`` in 0..1."""
         return F.pixel_shuffle(self.decode_blocks(predicted_latent, hidden1, hidden2), BLOCK) + 0.5
 
     def decode_blocks(
         self, predicted_latent: torch.Tensor, hidden1: torch.Tensor, hidden2: torch.Tensor
     ) -> torch.Tensor:
-        """The frame less 0.5 as blocks ``[..., 48, 16, 16]`` (see :func:`dynmap_rl.modules.layers.to_blocks`)."""
+        """Decode the frame minus 0.5, as blocks ``[..., 48, 16, 16]`` (:func:`dynmap_rl.modules.layers.to_blocks`)."""
         x = torch.cat([predicted_latent, hidden1, hidden2], -1)
         return self.layers(self.expand(x).flatten(0, -2)).unflatten(0, x.shape[:-1])
 
 
 class DynamicsDecoder(nn.Module):
-    """``(z_hat_t, h1_t, h2_t)`` to dynamics: a shared two-layer MLP and one head a quantity.
+    """Shared two-layer MLP with one head for each quantity, from predicted latents and hidden states to dynamics.
 
     Args:
         input_size: Z + 2 H.
-        normalizers: one for each decoded quantity, any of position, velocity, acceleration, or none.
-        width: of the MLP.
+        normalizers: one for each decoded quantity: any of position, velocity, acceleration, or none.
+        width: width of the MLP.
 
     Raises:
-        ValueError: for an unknown quantity.
+        ValueError: a quantity is unknown.
     """
 
     def __init__(self, input_size: int, normalizers: Mapping[str, Normalizer], width: int = 256):
         super().__init__()
         unknown = set(normalizers) - set(DYNAMICS)
         if unknown:
-            raise ValueError(f"unknown dynamics {sorted(unknown)}; choose from {DYNAMICS}")
+            raise ValueError(f"dynamics must be any of {', '.join(DYNAMICS)}, got {sorted(unknown)}")
         self.quantities = tuple(q for q in DYNAMICS if q in normalizers)
         self.normalizers = nn.ModuleDict({q: normalizers[q] for q in self.quantities})
         if self.quantities:
@@ -75,7 +75,7 @@ class DynamicsDecoder(nn.Module):
     def forward(
         self, predicted_latent: torch.Tensor, hidden1: torch.Tensor, hidden2: torch.Tensor
     ) -> tuple[torch.Tensor, ...]:
-        """``[..., D]`` in SI units for each of ``quantities``, in their order."""
+        """Decode ``[..., Z]`` and ``[..., H]`` twice to ``[..., D]`` (SI units) for each of ``quantities``, in order."""
         if not self.quantities:
             return ()
         x = self.shared(torch.cat([predicted_latent, hidden1, hidden2], -1))

@@ -10,17 +10,17 @@ from .layers import BLOCK, down, same, to_blocks
 
 
 class Encoder(nn.Module):
-    """A plain CNN: uint8 or float frames ``[..., 3, 64, 64]`` in 0..255 to a latent ``[..., Z]``.
+    """Plain CNN from frames to latents.
 
-    Three convolutions over blocks of 4 x 4 pixels, down to 8 x 8. The frame's mean colour, which their norms take
-    away, reaches the latent through a linear map of its own. With ``keypoints`` a spatial softmax reads
-    the expected position of every channel of the 8 x 8 and 16 x 16 maps (Levine et al. 2016) and stands beside the
-    flattened map, so that the position of an object reaches the latent to a fraction of a pixel.
+    Three convolutions on blocks of 4 x 4 pixels end in maps of 8 x 8. The frame's mean colour, which the normalisation
+    removes, reaches the latent through a linear map of its own. With ``keypoints``, a spatial softmax adds the
+    expected position of every channel of the 8 x 8 and 16 x 16 maps (Levine et al. 2016), so that the position of an
+    object reaches the latent to a fraction of a pixel.
 
     Args:
         latent_size: Z.
-        channels: of the maps of stride 4 and 8.
-        keypoints: read out expected positions too.
+        channels: channels of the maps of stride 4 and 8.
+        keypoints: add expected positions.
     """
 
     def __init__(self, latent_size: int = 64, channels: tuple[int, int] = (32, 64), keypoints: bool = False):
@@ -38,21 +38,26 @@ class Encoder(nn.Module):
         self.color = nn.Linear(3, latent_size, bias=False)
 
     def forward(self, pixels: torch.Tensor) -> torch.Tensor:
+        """Encode frames ``[..., 3, 64, 64]`` in 0..255, uint8 or float, as latents ``[..., Z]``.
+
+        Raises:
+            ValueError: the frames have another shape.
+        """
         if pixels.shape[-3:] != (3, 64, 64):
             raise ValueError(f"pixels must be [..., 3, 64, 64], got {list(pixels.shape)}")
         x = pixels.reshape(-1, 3, 64, 64)
-        # Without gradients in chunks that stay in the processor's cache: twice as fast.
+        # Without gradients, chunks that fit into the processor's cache are twice as fast.
         chunks = (x,) if torch.is_grad_enabled() else x.split(64)
         return torch.cat([self._encode(chunk) for chunk in chunks]).reshape(*pixels.shape[:-3], -1)
 
     def _encode(self, x: torch.Tensor) -> torch.Tensor:
-        # In the convolutions' precision at once, which holds 0..255 exactly: most of the memory traffic is here.
+        # The precision of the convolutions holds 0..255 exactly; most of the memory traffic is here.
         autocast = torch.is_autocast_enabled(x.device.type)
         dtype = torch.get_autocast_dtype(x.device.type) if autocast else self.project.weight.dtype
         x = to_blocks(x).to(dtype)  # (N, 48, 16, 16)
-        pixels = x.permute(0, 2, 3, 1).flatten(1, 2)  # (N, 256, 48), whose mean is fastest as a product
+        pixels = x.permute(0, 2, 3, 1).flatten(1, 2)  # (N, 256, 48); a product is the fastest mean
         color = (x.new_full((1, 256), 1 / 256) @ pixels).float().view(-1, 3, BLOCK**2).mean(-1) / 255 - 0.5
-        # The weights are scaled for x / 255 - 0.5, instead of the frames.
+        # Scaling the weights replaces x / 255 - 0.5.
         weight, bias = self.stem.weight / 255, self.stem.bias - 0.5 * self.stem.weight.sum((1, 2, 3))
         x = F.conv2d(x, weight, bias, padding=1).relu()  # (N, C, 16, 16)
         y = self.top(x)  # (N, C, 8, 8)
@@ -61,17 +66,23 @@ class Encoder(nn.Module):
             features = torch.cat([self.squeeze(y).flatten(1), *points], -1)
         else:
             features = y.flatten(1)
-        return self.project(features) + 5 * self.color(color)  # (N, Z); 5, for mean colours differ little
+        return self.project(features) + 5 * self.color(color)  # (N, Z); mean colours differ little
 
 
 class SpatialSoftmax(nn.Module):
-    """Maps ``[N, C, H, W]`` to ``points`` expected positions ``[N, 2 points]`` in [-1, 1]."""
+    """Expected positions of learned heat maps (Levine et al. 2016).
+
+    Args:
+        channels: C of the input.
+        points: number of heat maps.
+    """
 
     def __init__(self, channels: int, points: int):
         super().__init__()
         self.logits = nn.Conv2d(channels, points, 1)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Map ``[N, C, H, W]`` to positions ``[N, 2 points]`` in [-1, 1]: x of all points, then y."""
         logits = self.logits(x).float()
         heat = F.softmax(logits.flatten(2), -1).unflatten(-1, logits.shape[2:])
         across = torch.linspace(-1, 1, heat.shape[-1], device=heat.device)

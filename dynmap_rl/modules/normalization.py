@@ -7,10 +7,14 @@ from torch import nn
 
 
 class Normalizer(nn.Module):
-    """Maps ``[low, high]`` to ``[-1, 1]``, linearly and without clipping.
+    """Linear map of ``[low, high]`` to ``[-1, 1]``, without clipping.
 
     Args:
-        low, high: ``[D]`` in SI units, ``low < high``.
+        low: ``[D]`` in SI units.
+        high: ``[D]``, above ``low``.
+
+    Raises:
+        ValueError: an entry of ``low`` is not below ``high``.
     """
 
     def __init__(self, low: torch.Tensor, high: torch.Tensor):
@@ -23,13 +27,13 @@ class Normalizer(nn.Module):
 
     @property
     def size(self) -> int:
-        """D."""
+        """Number of entries D."""
         return self.center.numel()
 
     def normalize(self, x: torch.Tensor) -> torch.Tensor:
-        """``[..., D]`` in SI units to [-1, 1]."""
+        """Map ``[..., D]`` from SI units to [-1, 1]."""
         return (x - self.center) / self.scale
 
     def denormalize(self, x: torch.Tensor) -> torch.Tensor:
-        """``[..., D]`` in [-1, 1] to SI units."""
+        """Map ``[..., D]`` from [-1, 1] to SI units."""
         return x * self.scale + self.center

@@ -10,12 +10,14 @@ from .recurrent import State, TwoLSTM
 
 
 class FeedforwardPolicy(nn.Module):
-    """``a_t = pi(z_t, h_t, g)``: an MLP (paper, Eq. 1).
+    """MLP policy ``a_t = pi(z_t, h_t, g)`` (paper, Eq. 1).
 
     Args:
-        latent_size, hidden_size: Z and H of the world model.
-        action, goal: normalisers; their sizes are A and G.
-        width: of the hidden layers.
+        latent_size: Z of the world model.
+        hidden_size: H of the world model.
+        action: normaliser of the actions; its size is A.
+        goal: normaliser of the goals; its size is G.
+        width: width of the hidden layers.
     """
 
     def __init__(
@@ -37,26 +39,28 @@ class FeedforwardPolicy(nn.Module):
         )
 
     def forward(self, latent, hidden1, hidden2, goal) -> torch.Tensor:
-        """``[..., Z]``, ``[..., H]`` twice and the goal ``[..., G]`` (SI units) to the action ``[..., A]`` (SI)."""
+        """Map ``[..., Z]``, ``[..., H]`` twice and goals ``[..., G]`` (SI units) to actions ``[..., A]`` (SI units)."""
         features = torch.cat([latent, hidden1, hidden2, self.goal.normalize(goal)], -1)
         return self.action.denormalize(self.layers(features))
 
     def step(self, latent, hidden1, hidden2, goal, state: State | None = None):
-        """The same for one time step; the state passes through, so that both policies are called alike."""
+        """Act for one time step; the state passes through, so that both policies have the same interface."""
         return self(latent, hidden1, hidden2, goal), state
 
     def initial_state(self, batch: int, device=None) -> None:
-        """None: it has no memory."""
+        """Return None, as the policy has no memory."""
         return None
 
 
 class RecurrentPolicy(nn.Module):
-    """``a_t, h_pi_{t+1} = pi(z_t, g, h_t, h_pi_t)``: two more LSTM cells (paper, Eq. 2).
+    """Policy with two LSTM cells of its own, ``a_t, h_pi_{t+1} = pi(z_t, g, h_t, h_pi_t)`` (paper, Eq. 2).
 
     Args:
-        latent_size, hidden_size: Z and H of the world model.
-        action, goal: normalisers; their sizes are A and G.
-        width: hidden size of the policy's own cells.
+        latent_size: Z of the world model.
+        hidden_size: H of the world model.
+        action: normaliser of the actions; its size is A.
+        goal: normaliser of the goals; its size is G.
+        width: hidden size of the policy's cells.
     """
 
     def __init__(
@@ -74,19 +78,19 @@ class RecurrentPolicy(nn.Module):
         self.head = nn.Sequential(nn.Linear(2 * width, width), nn.SiLU(), nn.Linear(width, action.size))
 
     def forward(self, latent, hidden1, hidden2, goal) -> torch.Tensor:
-        """Sequence form: ``[B, T, ...]`` each, to actions ``[B, T, A]`` (SI units), from ``h_pi_0 = 0``."""
+        """Act for a sequence ``[B, T, ...]``, from ``h_pi_0 = 0``; actions ``[B, T, A]`` (SI units)."""
         x = self._embed(latent, hidden1, hidden2, goal)
         _, top, _ = self.lstm(x)
         return self._act(x, top)
 
     def step(self, latent, hidden1, hidden2, goal, state: State) -> tuple[torch.Tensor, State]:
-        """Step form: ``[B, ...]`` each and ``h_pi_t`` to the action ``[B, A]`` and ``h_pi_{t+1}``."""
+        """Act for one step: ``[B, ...]`` each and ``h_pi_t`` to actions ``[B, A]`` and ``h_pi_{t+1}``."""
         x = self._embed(latent, hidden1, hidden2, goal)
         state = self.lstm.step(x, state)
         return self._act(x, state[2]), state
 
     def initial_state(self, batch: int, device=None) -> State:
-        """The memory at the start of B episodes: four zero tensors ``[B, width]``."""
+        """Return the memory at the start of B episodes: four zero tensors ``[B, width]``."""
         return self.lstm.initial_state(batch, device)
 
     def _embed(self, latent, hidden1, hidden2, goal) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""bfloat16 where it is fast."""
+"""Mixed precision where the processor supports it."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import torch
 
 
 def mixed_precision(device: torch.device | str) -> torch.autocast:
-    """bfloat16 where the processor computes with it: a recurrent policy's update takes a third of the time."""
+    """Return an autocast to bfloat16, enabled where the device computes in bfloat16."""
     kind = torch.device(device).type
     fast = kind != "cpu" or (
         torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported()
     )
-    # No cache of cast weights: threads would share it, and no weight is used twice.
+    # Threads would share a cache of cast weights, and no weight is used twice.
     return torch.autocast(kind, torch.bfloat16, enabled=fast, cache_enabled=False)

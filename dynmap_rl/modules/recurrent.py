@@ -9,18 +9,18 @@ State = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 
 
 class TwoLSTM(nn.Module):
-    """Two LSTM layers that give the hidden state of both at every step.
+    """Two LSTM layers that return the hidden states of both layers at every step.
 
     The state is ``(hidden1, cell1, hidden2, cell2)``, each ``[B, H]``; None stands for zeros.
 
     Args:
-        input_size: size of the input.
+        input_size: entries of the input.
         hidden_size: H.
     """
 
     def __init__(self, input_size: int, hidden_size: int):
         super().__init__()
-        # Two modules, not num_layers=2: that would hide the first layer's states.
+        # num_layers=2 would hide the first layer's states.
         self.lstm1 = nn.LSTM(input_size, hidden_size, batch_first=True)
         self.lstm2 = nn.LSTM(hidden_size, hidden_size, batch_first=True)
         self.hidden_size = hidden_size
@@ -28,7 +28,7 @@ class TwoLSTM(nn.Module):
     def forward(
         self, x: torch.Tensor, state: State | None = None
     ) -> tuple[torch.Tensor, torch.Tensor, State]:
-        """``[B, T, input]`` to ``hidden1``, ``hidden2`` ``[B, T, H]`` after each step, and the last state."""
+        """Map ``[B, T, input]`` to ``hidden1``, ``hidden2`` ``[B, T, H]`` after each step, and the last state."""
         state1 = state2 = None
         if state is not None:
             h1, c1, h2, c2 = (s[None].contiguous() for s in state)
@@ -38,19 +38,19 @@ class TwoLSTM(nn.Module):
         return hidden1, hidden2, (h1[0], c1[0], h2[0], c2[0])
 
     def step(self, x: torch.Tensor, state: State) -> State:
-        """One step: ``[..., input]`` and the state, ``[..., H]`` each, to the next state."""
+        """Map one step's input ``[..., input]`` and the state, ``[..., H]`` each, to the next state."""
         flat = tuple(s.reshape(-1, self.hidden_size) for s in state)
         after = self(x.reshape(-1, 1, x.shape[-1]), flat)[2]
         return tuple(s.reshape(*x.shape[:-1], -1) for s in after)
 
     def initial_state(self, batch: int, device=None) -> State:
-        """The state at the start of B episodes: four zero tensors ``[B, H]``."""
+        """Return the state at the start of B episodes: four zero tensors ``[B, H]``."""
         return tuple(torch.zeros(batch, self.hidden_size, device=device) for _ in range(4))
 
 
 def delay(x: torch.Tensor) -> torch.Tensor:
     """Shift ``[B, T, ...]`` by one step: out[:, t] = x[:, t-1], and zeros at t = 0.
 
-    A recurrent part that reads step t writes what holds at t + 1. This puts it where it holds.
+    A recurrent module that reads step t predicts step t + 1; the shift stores the prediction at its own time.
     """
     return torch.cat([torch.zeros_like(x[:, :1]), x[:, :-1]], 1)

@@ -1,4 +1,4 @@
-"""The paper's Tables I, II and III: mean (std) over three policy seeds of DR (%), PE (mm) and SR (%)."""
+"""Names of supervisions, as options and as rows of the paper's tables."""
 
 from __future__ import annotations
 
@@ -8,7 +8,12 @@ from dynmap_rl.keys import DYNAMICS
 
 
 def row_name(supervision: Iterable[str], training: str = "decoupled") -> str:
-    """The paper's name of a row: ``("position", "velocity")`` is ``RGB+[P+V]``, none is ``Only-RGB``."""
+    """Return the name of a row in the paper's tables.
+
+    Args:
+        supervision: quantities; ``("position", "velocity")`` is ``RGB+[P+V]``, and none is ``Only-RGB``.
+        training: ``end_to_end`` is ``End-to-End`` with any supervision.
+    """
     if training == "end_to_end":
         return "End-to-End"
     letters = [q[0].upper() for q in DYNAMICS if q in supervision]
@@ -16,13 +21,12 @@ def row_name(supervision: Iterable[str], training: str = "decoupled") -> str:
 
 
 def parse_supervision(text: str) -> tuple[str, ...]:
-    """``"position,velocity"`` to a tuple in the paper's order; ``"none"`` to ``()``.
+    """Parse ``"position,velocity"`` to a tuple in the paper's order, and ``"none"`` to ``()``.
 
     Raises:
-        ValueError: for an unknown quantity.
+        ValueError: a quantity is unknown.
     """
     names = [] if text.strip().lower() in ("", "none") else [name.strip() for name in text.split(",")]
-    unknown = set(names) - set(DYNAMICS)
-    if unknown:
-        raise ValueError(f"unknown supervision {sorted(unknown)}; choose from {', '.join(DYNAMICS)}, or none")
+    if unknown := set(names) - set(DYNAMICS):
+        raise ValueError(f"supervision must be any of {', '.join(DYNAMICS)}, or none, got {sorted(unknown)}")
     return tuple(q for q in DYNAMICS if q in names)

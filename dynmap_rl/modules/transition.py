@@ -10,7 +10,7 @@ from .recurrent import State, TwoLSTM, delay
 
 
 class Transition(nn.Module):
-    """Two LSTM layers over latent and action; the next latent is predicted as a change of this one.
+    """Two LSTM layers on latent and action, which predict the change of the latent.
 
     Args:
         action: normaliser of the actions; its size is A.
@@ -27,21 +27,21 @@ class Transition(nn.Module):
     def forward(
         self, latent: torch.Tensor, action: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Sequence form, from ``h_0 = 0``.
+        """Predict a sequence, from ``h_0 = 0``.
 
         Args:
             latent: z, ``[B, T, Z]``.
             action: ``[B, T, A]`` (SI units).
 
         Returns:
-            ``predicted_latent`` ``[B, T, Z]`` and ``hidden1``, ``hidden2`` ``[B, T, H]``, all *at* time t: what is
-            predicted for t from everything before t. At t = 0 they are zeros: there is no prediction.
+            ``predicted_latent`` ``[B, T, Z]`` and ``hidden1``, ``hidden2`` ``[B, T, H]``. The entry at t is predicted
+            from everything before t. At t = 0 there is no prediction, and the entries are zeros.
         """
         hidden1, hidden2, _ = self.lstm(torch.cat([latent, self.action.normalize(action)], -1))
         predicted = latent + self.change(hidden2)
         return delay(predicted), delay(hidden1), delay(hidden2)
 
     def step(self, latent: torch.Tensor, action: torch.Tensor, state: State) -> tuple[torch.Tensor, State]:
-        """Step form: ``z_t`` ``[B, Z]``, ``a_t`` ``[B, A]`` and ``h_t`` to ``z_hat_{t+1}`` and ``h_{t+1}``."""
+        """Predict one step: ``z_t`` ``[B, Z]``, ``a_t`` ``[B, A]`` and ``h_t`` to ``z_hat_{t+1}`` and ``h_{t+1}``."""
         state = self.lstm.step(torch.cat([latent, self.action.normalize(action)], -1), state)
         return latent + self.change(state[2]), state

@@ -16,13 +16,14 @@ from .transition import Transition
 
 
 class WorldModel(nn.Module):
-    """Frames and actions to latents, hidden states, predicted frames and predicted dynamics.
+    """Encoder, transition and decoders.
 
     Args:
         action: normaliser of the actions.
-        dynamics: a normaliser for each supervised quantity: any of position, velocity, acceleration, or none.
-        latent_size, hidden_size: Z and H.
-        keypoints: of the encoder.
+        dynamics: normaliser of each supervised quantity: any of position, velocity, acceleration, or none.
+        latent_size: Z.
+        hidden_size: H.
+        keypoints: see :class:`Encoder`.
     """
 
     def __init__(
@@ -42,12 +43,16 @@ class WorldModel(nn.Module):
 
     @property
     def supervision(self) -> tuple[str, ...]:
-        """The quantities that are decoded."""
+        """Quantities that are decoded, in the paper's order."""
         return self.dynamics_decoder.quantities
 
     def encode(self, pixels: torch.Tensor, mixed: bool = False) -> torch.Tensor:
-        """``z_t = ENC(I_t)``: frames ``[..., 3, 64, 64]`` to latents ``[..., Z]``, with ``mixed`` in the precision
-        of training (:func:`mixed_precision`), up to three times as fast."""
+        """Encode frames ``[..., 3, 64, 64]`` as latents ``[..., Z]``: ``z_t = ENC(I_t)``.
+
+        Args:
+            pixels: frames, 0..255.
+            mixed: use the precision of training (:func:`mixed_precision`), up to three times as fast.
+        """
         if not mixed:
             return self.encoder(pixels)
         with mixed_precision(pixels.device):
@@ -56,22 +61,22 @@ class WorldModel(nn.Module):
     def predict(
         self, latent: torch.Tensor, action: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """``predicted_latent``, ``hidden1``, ``hidden2`` at every t of a sequence (:meth:`Transition.forward`)."""
+        """Predict ``predicted_latent``, ``hidden1``, ``hidden2`` of a sequence (see :meth:`Transition.forward`)."""
         return self.transition(latent, action)
 
     def step(self, latent: torch.Tensor, action: torch.Tensor, state: State) -> tuple[torch.Tensor, State]:
-        """The same, one step at a time (:meth:`Transition.step`)."""
+        """Predict one step (see :meth:`Transition.step`)."""
         return self.transition.step(latent, action, state)
 
     def initial_state(self, batch: int, device=None) -> State:
-        """``h_0 = 0``."""
+        """Return ``h_0 = 0`` of B episodes."""
         return self.transition.lstm.initial_state(batch, device)
 
     def decode_pixels(self, predicted_latent, hidden1, hidden2) -> torch.Tensor:
-        """Predicted frames ``[..., 3, 64, 64]`` in 0..1."""
+        """Decode predicted frames ``[..., 3, 64, 64]`` in 0..1."""
         return self.image_decoder(predicted_latent, hidden1, hidden2)
 
     def decode_dynamics(self, predicted_latent, hidden1, hidden2) -> dict[str, torch.Tensor]:
-        """Predicted dynamics ``[..., D]`` by quantity (SI units)."""
+        """Decode predicted dynamics ``[..., D]`` by quantity (SI units)."""
         values = self.dynamics_decoder(predicted_latent, hidden1, hidden2)
         return dict(zip(self.supervision, values, strict=True))

@@ -1,7 +1,5 @@
-"""Losses."""
+"""Losses of world models and policies as TorchRL loss modules."""
 
-from .imitation import ImitationLoss, imitation_loss
-from .joint import JointLoss
-from .world_model import WorldModelLoss
+import lazy_loader
 
-__all__ = ["ImitationLoss", "JointLoss", "WorldModelLoss", "imitation_loss"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

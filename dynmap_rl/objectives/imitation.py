@@ -22,20 +22,24 @@ def imitation_loss(
     ignore: torch.Tensor | None = None,
     emphasis: float = 0.0,
 ) -> torch.Tensor:
-    """Mean absolute difference of two actions ``[B, T, A]`` (SI units), in normalised units: a scalar.
+    """Return the mean absolute difference of two actions in normalised units, a scalar.
 
     Args:
-        ignore: bool ``[B, T, 1]``, steps that do not count (the demonstrator did not act in them).
-        emphasis: steps count ``1 + emphasis * |a_t - a_{t-1}|`` times (normalised, ``a_{-1} = 0``). The world model's
-            memory holds the last action, and copying it is nearly right in most steps; this gives weight to those in
-            which the expert decides (keyframe-focused imitation, Wen et al. 2021). 0 is the paper's loss.
+        predicted: the policy's actions, ``[B, T, A]`` (SI units).
+        action: the demonstrator's actions, ``[B, T, A]`` (SI units).
+        normalizer: of the actions.
+        ignore: bool ``[B, T, 1]``, steps to leave out because the demonstrator did not act.
+        emphasis: every step is weighted by ``1 + emphasis * |a_t - a_{t-1}|`` (normalised, ``a_{-1} = 0``). The world
+            model's memory holds the last action, and copying it has a low loss in most steps; the weight stresses
+            the steps in which the expert changes its action (keyframe-focused imitation, Wen et al. 2021). 0 is the
+            paper's loss.
     """
     error = ((predicted - action) / normalizer.scale).abs().mean(-1, keepdim=True)
     weight = torch.ones_like(error)
     if emphasis:
         before = F.pad(action[:, :-1], (0, 0, 1, 0))
         weight = weight + emphasis * ((action - before) / normalizer.scale).abs().mean(-1, keepdim=True)
-    if ignore is not None:  # by choice, not by a product: what is ignored may be NaN
+    if ignore is not None:  # not by a product, since ignored entries may be NaN
         error, weight = (torch.where(ignore, 0.0, x) for x in (error, weight))
     return (error * weight).sum() / weight.sum().clamp_min(1)
 
@@ -43,7 +47,13 @@ def imitation_loss(
 def find_ignored(
     tensordict: TensorDictBase, disturbed: NestedKey, masks: tuple[NestedKey, ...]
 ) -> torch.Tensor | None:
-    """Bool ``[B, T, 1]``: the steps that are disturbed or that a mask marks as invalid; None where there is neither."""
+    """Return the steps to leave out, bool ``[B, T, 1]``, or None.
+
+    Args:
+        tensordict: ``[B, T]``.
+        disturbed: key of the steps in which the demonstrator did not act.
+        masks: keys of masks that are false for invalid steps.
+    """
     ignore = tensordict.get(disturbed, None)
     for key in masks:
         if (mask := tensordict.get(key, None)) is not None:
@@ -53,16 +63,16 @@ def find_ignored(
 
 
 class ImitationLoss(LossModule):
-    """:func:`imitation_loss` of a policy on latents and hidden states (paper, Sec. III-B).
+    """L1 loss of a policy on latents and hidden states (paper, Sec. III-B); see :func:`imitation_loss`.
 
-    Input ``[B, T]``: ``latent``, ``hidden1``, ``hidden2``, ``goal``, the demonstrator's ``action`` (SI units) and,
-    optional, ``disturbed`` bool ``[B, T, 1]``: the steps that do not count. A mask of valid steps is optional too, as in
+    Input ``[B, T]``: ``latent``, ``hidden1``, ``hidden2``, ``goal`` and the demonstrator's ``action`` (SI units).
+    Optional: ``disturbed`` bool ``[B, T, 1]``, the steps to leave out, and a mask of valid steps as in
     :class:`dynmap_rl.objectives.WorldModelLoss`.
 
     Output: ``loss_policy``, a scalar.
 
     Args:
-        policy: what is trained.
+        policy: policy to train.
         emphasis: see :func:`imitation_loss`.
     """
 
@@ -84,17 +94,18 @@ class ImitationLoss(LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """What the loss reads, as ``set_keys`` names it."""
+        """Keys that the loss reads."""
         keys = self.tensor_keys
         return [unravel_key(k) for k in (keys.latent, keys.hidden1, keys.hidden2, keys.goal, keys.action)]
 
     @property
     def out_keys(self) -> list[str]:
-        """The loss."""
+        """Keys that the loss writes."""
         return ["loss_policy"]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Return the loss."""
         *states, action = (tensordict[key] for key in self.in_keys)
         ignore = find_ignored(tensordict, self.tensor_keys.disturbed, self._loss_mask_keys())
         loss = imitation_loss(self.policy(*states), action, self.policy.action, ignore, self.emphasis)

@@ -1,4 +1,4 @@
-"""World model and policy in one loss: joint and end-to-end training (paper, Eq. 3 and 4)."""
+"""Loss of joint and end-to-end training (paper, Eq. 3 and 4)."""
 
 from __future__ import annotations
 
@@ -10,24 +10,27 @@ from tensordict.utils import NestedKey, unravel_key
 from torchrl.objectives.common import LossModule
 
 from dynmap_rl.modules.policy import FeedforwardPolicy, RecurrentPolicy
+
 from .imitation import find_ignored, imitation_loss
 from .world_model import WorldModelLoss
 
 
 class JointLoss(LossModule):
-    """Eq. 4 with the dynamics terms of Eq. 5, or Eq. 3: the policy's loss reaches encoder and transition.
+    """Loss of world model and policy: Eq. 4 with the dynamics terms of Eq. 5, or Eq. 3.
 
-    Input: that of :class:`WorldModelLoss`, with ``goal`` ``[B, T, G]`` and, optional, ``disturbed`` bool
-    ``[B, T, 1]``: the steps that imitation leaves out, as it does those that a mask marks as invalid.
+    The gradient of the policy's loss reaches encoder and transition.
 
-    Output: ``loss_policy`` (times ``beta_joint``) and, but for end-to-end training, the world model's losses.
+    Input: the input of :class:`WorldModelLoss` and ``goal`` ``[B, T, G]``. Optional: ``disturbed`` bool ``[B, T, 1]``,
+    the steps that the policy's loss leaves out, as it leaves out steps that a mask marks as invalid.
+
+    Output: ``loss_policy`` (times ``beta_joint``) and, except for end-to-end training, the world model's losses.
 
     Args:
-        world_model_loss: with the world model.
-        policy: trained with it.
+        world_model_loss: loss of the world model, which holds the world model.
+        policy: policy to train.
         beta_joint: weight of the policy's loss.
         emphasis: see :func:`imitation_loss`.
-        end_to_end: the policy's loss alone (Eq. 3).
+        end_to_end: minimise the policy's loss alone (Eq. 3).
     """
 
     @dataclass
@@ -55,14 +58,14 @@ class JointLoss(LossModule):
         super().set_keys(**vars(world_model_loss.tensor_keys))
 
     def set_keys(self, **kwargs) -> None:
-        """Those of the world model's loss are its keys too."""
+        """Set keys of this loss and of the world model's loss."""
         super().set_keys(**kwargs)
         own = ("goal", "disturbed")
         self.world_model_loss.set_keys(**{k: v for k, v in kwargs.items() if k not in own})
 
     @property
     def loss_mask_key(self) -> NestedKey | None:
-        """That of the world model's loss (see :class:`torchrl.objectives.LossModule`)."""
+        """Key of the mask of valid steps (see :class:`torchrl.objectives.LossModule`)."""
         return self.world_model_loss.loss_mask_key
 
     @loss_mask_key.setter
@@ -71,17 +74,18 @@ class JointLoss(LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """What the loss reads, as ``set_keys`` of it and of the world model's loss name it."""
+        """Keys that the loss reads."""
         keys = self.world_model_loss.in_keys
         return [*(keys[:2] if self.end_to_end else keys), unravel_key(self.tensor_keys.goal)]
 
     @property
     def out_keys(self) -> list[str]:
-        """The losses, to be added up."""
+        """Keys that the loss writes; their sum is to be minimised."""
         return [*([] if self.end_to_end else self.world_model_loss.out_keys), "loss_policy"]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Return the losses."""
         latent, states = self.world_model_loss.predict(tensordict)
         losses = {} if self.end_to_end else self.world_model_loss.compare(tensordict, latent, states)
         predicted = self.policy(latent, *states[1:], tensordict[self.tensor_keys.goal])

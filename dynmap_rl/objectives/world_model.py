@@ -1,4 +1,4 @@
-"""The world model's losses: RGB reconstruction, latent consistency, and dynamics (paper, Eq. 4a and 5)."""
+"""Losses of a world model: RGB reconstruction, latent consistency and dynamics (paper, Eq. 4a and 5)."""
 
 from __future__ import annotations
 
@@ -15,29 +15,28 @@ from dynmap_rl.modules.world_model import WorldModel
 
 
 class WorldModelLoss(LossModule):
-    """The losses of Eq. 4a and 5 on windows of frames, actions and dynamics.
+    """Losses of Eq. 4a and 5 on windows of frames, actions and dynamics.
 
     Every term is the mean over the time steps t >= 1 of a root mean square: the L2 norm of the paper's equations
-    (not its square), divided by the square root of the number of entries, so that frames, latents and dynamics are
-    of one scale and no constant has to weigh them.
+    (not its square), divided by the square root of the number of entries. Frames, latents and dynamics then have one
+    scale.
 
-    Input: ``pixels`` uint8 ``[B, T, 3, 64, 64]``, ``action`` ``[B, T, A]`` and, for the model's supervision,
-    ``("dynamics", quantity)`` ``[B, T, D]``, in SI units.
+    Input: ``pixels`` uint8 ``[B, T, 3, 64, 64]``, ``action`` ``[B, T, A]`` and, for every supervised quantity,
+    ``("dynamics", quantity)`` ``[B, T, D]``, in SI units. Optional: a mask of valid steps, bool ``[B, T]`` or
+    ``[B, T, 1]``, under ``loss_mask_key`` of :class:`torchrl.objectives.LossModule`, by default
+    ``("collector", "mask")``; invalid steps are left out.
 
-    Steps that a mask marks as invalid (bool ``[B, T]`` or ``[B, T, 1]``, false where padded) do not count; which
-    entry that is says ``loss_mask_key`` of :class:`torchrl.objectives.LossModule`, by default ``("collector", "mask")``.
-
-    Output: ``loss_rgb``, ``loss_latent`` (times ``beta_z``), ``loss_position``, ``loss_velocity``,
-    ``loss_acceleration`` (those supervised, times ``beta_dynamics``): scalars whose sum is to be minimised.
+    Output: ``loss_rgb``, ``loss_latent`` (times ``beta_z``) and, where supervised, ``loss_position``,
+    ``loss_velocity``, ``loss_acceleration`` (times ``beta_dynamics``): scalars whose sum is to be minimised.
 
     Args:
-        world_model: what is trained.
+        world_model: world model to train.
         beta_z: weight of the latent loss.
-        beta_dynamics: weight of each dynamics loss; all quantities have the same.
-        stop_gradient: the latent loss moves the predicted change of the latent only. With its full gradient it is
-            least for latents that do not vary, and the reconstruction stalls.
-        rgb_steps: decode the frames of so many random steps of a window; None decodes all.
-        generator: draws those steps; by default torch's own.
+        beta_dynamics: weight of the loss of every supervised quantity.
+        stop_gradient: train only the predicted change of the latent with the latent loss. Its full gradient favours
+            latents that do not vary, and the reconstruction stalls.
+        rgb_steps: number of random steps of a window whose frames are decoded; None decodes all.
+        generator: generator that draws these steps; by default torch's own.
     """
 
     @dataclass
@@ -65,28 +64,35 @@ class WorldModelLoss(LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """What the loss reads, as ``set_keys`` names it; only the dynamics that the world model decodes."""
+        """Keys that the loss reads; of the dynamics, those that the world model decodes."""
         keys = self.tensor_keys
         dynamics = [(keys.dynamics, quantity) for quantity in self.world_model.supervision]
         return [unravel_key(key) for key in (keys.pixels, keys.action, *dynamics)]
 
     @property
     def out_keys(self) -> list[str]:
-        """The losses, to be added up."""
+        """Keys that the loss writes; their sum is to be minimised."""
         return [f"loss_{name}" for name in ("rgb", "latent", *self.world_model.supervision)]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Return the losses."""
         return TensorDict(self.compare(tensordict, *self.predict(tensordict)), [])
 
     def predict(self, tensordict: TensorDictBase) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
-        """The latents ``[B, T, Z]``, and ``predicted_latent``, ``hidden1``, ``hidden2`` at every t."""
+        """Return the latents ``[B, T, Z]``, and ``predicted_latent``, ``hidden1``, ``hidden2`` at every t."""
         latent = self.world_model.encode(tensordict[self.tensor_keys.pixels]).float()
         with torch.autocast(latent.device.type, enabled=False):
             return latent, self.world_model.predict(latent, tensordict[self.tensor_keys.action])
 
     def compare(self, tensordict: TensorDictBase, latent: torch.Tensor, states) -> dict[str, torch.Tensor]:
-        """The losses by name, for what :meth:`predict` gave."""
+        """Return the losses by name.
+
+        Args:
+            tensordict: the input.
+            latent: first result of :meth:`predict`.
+            states: second result of :meth:`predict`.
+        """
         model, keys = self.world_model, self.tensor_keys
         predicted, hidden1, hidden2 = (x[:, 1:] for x in states)  # (B, T-1, .)
         pixels = tensordict[keys.pixels][:, 1:]
@@ -102,7 +108,7 @@ class WorldModelLoss(LossModule):
         return losses
 
     def _mean(self, error: torch.Tensor, masks: TensorDictBase) -> torch.Tensor:
-        """Over the steps ``[B, T]`` that count."""
+        """Return the mean of an error over the valid steps ``[B, T]``."""
         return self._reduce_loss(error, masks, reduction="mean")
 
     def _latent_error(self, latent, predicted) -> torch.Tensor:
@@ -124,5 +130,5 @@ class WorldModelLoss(LossModule):
 
 
 def rms(x: torch.Tensor) -> torch.Tensor:
-    """Root mean square over the last axis, smooth at zero."""
+    """Return the root mean square over the last axis, smooth at zero."""
     return (x.square().mean(-1) + 1e-8).sqrt()

@@ -1,6 +1,5 @@
-"""Tasks to be played and watched: a session without a window, and the window."""
+"""A session that drives a world, and the window that shows it."""
 
-from .session import DRIVERS, Hand, Session
-from .window import PlayWindow
+import lazy_loader
 
-__all__ = ["DRIVERS", "Hand", "PlayWindow", "Session"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

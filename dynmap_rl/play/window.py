@@ -1,4 +1,4 @@
-"""The window: the scene, what the world model sees in it, and traces of the dynamics, true and predicted."""
+"""The play window: the scene, the world model's prediction, and traces of true and predicted dynamics."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from dynmap_rl.envs.renderer import Renderer, pygame
 from dynmap_rl.envs.world import ACCELERATION_LIMIT, EPISODE_STEPS, VELOCITY_LIMIT
 from dynmap_rl.keys import DYNAMICS
+
 from .session import Session
 
 BLACK, GRAY, LIGHT, WHITE, GREEN = (0, 0, 0), (120, 120, 120), (225, 225, 225), (255, 255, 255), (44, 160, 44)
@@ -29,10 +30,10 @@ KEYS = {  # axis and sign
 
 
 class PlayWindow:
-    """Shows a session, and hands it what keys and mouse say.
+    """Window that shows a session and passes keys and mouse to it.
 
     Args:
-        session: what is played.
+        session: session to show.
         size: side of the scene, in pixels.
 
     Raises:
@@ -50,11 +51,11 @@ class PlayWindow:
             pygame.display.init()
             self.screen = pygame.display.set_mode((self.width, self.height))
             if pygame.display.get_driver() == "offscreen" and "SDL_VIDEODRIVER" not in os.environ:
-                raise pygame.error("SDL finds none")  # but would draw where nobody sees it
+                raise pygame.error("SDL finds none")  # it would draw off screen
         except pygame.error as error:
             raise ValueError(
-                f"there is no display to open a window on ({error}); with SDL_VIDEODRIVER=dummy it works without one, "
-                "to write a --gif"
+                f"there is no display to open a window on ({error}); set SDL_VIDEODRIVER=dummy to write a --gif "
+                "without one"
             ) from error
         pygame.display.set_caption("dynmap_rl")
         self.font = pygame.font.Font(None, LINE)
@@ -65,7 +66,7 @@ class PlayWindow:
         pygame.display.quit()
 
     def handle(self) -> None:
-        """Take in what was pressed since the last time."""
+        """Process the keys and mouse events since the last call."""
         for event in pygame.event.get():
             if event.type == pygame.QUIT:
                 self.open = False
@@ -108,7 +109,7 @@ class PlayWindow:
             self.session.driver, self.session.hand.target = "hand", (x, y)
 
     def draw(self) -> np.ndarray:
-        """Show the present; the picture uint8 ``[height, width, 3]``."""
+        """Draw the present and return the picture, uint8 ``[height, width, 3]``."""
         session, size = self.session, self.size
         self.screen.fill(WHITE)
         self._write(f"{session.env.task.name}: {session.driver} drives", MARGIN, MARGIN)

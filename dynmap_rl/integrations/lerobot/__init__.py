@@ -1,4 +1,4 @@
-"""LeRobot's own commands on our environments, data and models.
+"""LeRobot's commands on the environments, datasets and models of this package.
 
 Importing it registers the environment ``dynmap`` and the policy ``dynmap``. LeRobot does so by
 ``--policy.discover_packages_path=dynmap_rl.integrations.lerobot``, or without an option where the distribution in

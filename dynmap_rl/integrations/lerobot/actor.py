@@ -1,4 +1,4 @@
-"""Policies of LeRobot as TensorDict modules: ACT, Diffusion and the like in our environments and evaluation."""
+"""Policies of LeRobot, such as ACT and Diffusion, as TensorDict modules."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from lerobot.utils.constants import OBS_STATE
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from dynmap_rl.data.demonstrations import CAMERA
+from dynmap_rl.keys import CAMERA
 from dynmap_rl.utils.hub import first_line
 
 
 class LeRobotActor(TensorDictModuleBase):
-    """A trained policy of LeRobot as an actor: reads ``pixels`` ``[B, 3, 64, 64]`` and ``agent_pos`` ``[B, 5]``, writes
-    ``action`` ``[B, 3]`` (m, m, rad), one time step a call.
+    """Trained LeRobot policy as a TensorDict policy, one time step a call.
 
-    Its memory (chunks of actions, past observations) is that of one batch of episodes, which all begin at the same time:
-    call :meth:`reset` before the first step of the next ones.
+    It reads ``pixels`` ``[B, 3, 64, 64]`` and ``agent_pos`` ``[B, 5]`` and writes ``action`` ``[B, 3]`` (m, m, rad). Its
+    memory (chunks of actions, past observations) belongs to one batch of episodes, which all begin at the same time:
+    call :meth:`reset` before the first step of the next batch.
 
     Args:
-        path: a ``pretrained_model`` folder of ``lerobot-train``, or the id of a policy on the Hugging Face hub.
-        device: to run on.
-        instruction: for policies that read one; our datasets have the task's ``description``.
+        path: ``pretrained_model`` folder of ``lerobot-train``, or the id of a policy on the Hugging Face hub.
+        device: device to run on.
+        instruction: text for policies that read one; datasets of the tasks have the task's ``description``.
 
     Raises:
-        ValueError: there is no such policy.
+        ValueError: the folder or id holds no LeRobot policy.
     """
 
     in_keys = ["pixels", "agent_pos"]
@@ -46,15 +46,18 @@ class LeRobotActor(TensorDictModuleBase):
             )
         except (OSError, KeyError, ValueError, ImportError) as error:
             reason = first_line(error)
-            raise ValueError(f"{path} holds no policy of LeRobot ({reason})") from error
+            raise ValueError(
+                f"{path} must be a policy of LeRobot, but it cannot be loaded ({reason}); check the path"
+            ) from error
         self.reset()
 
     def reset(self) -> None:
-        """All episodes of the batch begin."""
+        """Clear the memory, as all episodes of the batch begin."""
         self.policy.reset()
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action of this step."""
         before, after = self.processors
         observation = {CAMERA: tensordict["pixels"].float() / 255, OBS_STATE: tensordict["agent_pos"]}
         action = self.policy.select_action(

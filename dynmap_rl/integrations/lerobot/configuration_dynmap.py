@@ -1,4 +1,4 @@
-"""Settings of the policy ``dynmap``; LeRobot finds the other two files of the three by this one's name."""
+"""Settings of the policy ``dynmap``; LeRobot derives the names of the other two modules from this one's."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 
-from dynmap_rl.data.demonstrations import FRAME_SHAPE
+from dynmap_rl.keys import FRAME_SHAPE
 from dynmap_rl.modules.checkpoints import check_policy
 from dynmap_rl.modules.supervision import parse_supervision
 
@@ -16,29 +16,35 @@ from dynmap_rl.modules.supervision import parse_supervision
 @PreTrainedConfig.register_subclass("dynmap")
 @dataclass
 class DynmapConfig(PreTrainedConfig):
-    """``--policy.type=dynmap``: a world model and a policy, trained jointly (paper, Eq. 4 and 5).
+    """Settings of ``--policy.type=dynmap``: world model and policy, trained jointly (paper, Eq. 4 and 5).
 
-    Defaults are those of ``recipes/joint.py``, whose batches have as many windows as LeRobot's (8).
+    The defaults are those of ``recipes/joint.py``, with LeRobot's batch size of 8.
 
-    Args:
-        supervision: which dynamics the world model is supervised on: any of ``position,velocity,acceleration``, or
-            ``none`` (Only-RGB). The dataset needs the columns ``dynamics.*``.
-        kind: of the policy: ``recurrent`` or ``feedforward``.
-        latent_size, hidden_size, keypoints: of the world model.
-        width: of the policy; 0 for its default.
-        window_steps: steps of a training window, which lies within one episode.
+    Attributes:
+        supervision: dynamics that the world model predicts: any of ``position,velocity,acceleration``, or ``none``
+            (Only-RGB). The dataset needs the columns ``dynamics.*``.
+        kind: ``recurrent`` or ``feedforward`` policy.
+        latent_size: Z of the world model.
+        hidden_size: H of the world model.
+        keypoints: add spatial-softmax keypoints to the encoder.
+        width: width of the policy; 0 for its default.
+        window_steps: steps of a training window.
         rgb_steps: decoded frames of a window.
-        beta_z, beta_dynamics, beta_joint, emphasis: of the losses (see ``dynmap_rl.objectives``).
-        recolor: permute the colour channels of training windows, and paint up to ``distractors`` bars on each.
-        symmetric: mirror and shift training windows too, which is right where the task has no places of its own. By
-            default what the task is that the dataset tells, and false where it tells none.
-        mixed: train, and encode frames in control, in bfloat16 where the processor computes with it.
-        optimizer_lr, optimizer_weight_decay: of AdamW.
-        task: that the policy was trained on; written by training where the dataset tells it.
-        source: where its world model is from (see :func:`dynmap_rl.frozen.load_source`); written by training too.
+        beta_z: weight of the latent loss.
+        beta_dynamics: weight of the loss of every supervised quantity.
+        beta_joint: weight of the policy's loss.
+        emphasis: see :func:`dynmap_rl.objectives.imitation_loss`.
+        recolor: permute the colour channels of training windows, and paint bars on the background.
+        distractors: largest number of bars of a window.
+        symmetric: mirror and shift training windows. By default, true where the dataset's task is symmetric.
+        mixed: train, and encode frames in control, in bfloat16 where the processor supports it.
+        optimizer_lr: learning rate of AdamW.
+        optimizer_weight_decay: weight decay of AdamW.
+        task: task of the dataset; written by training.
+        source: origin of the world model (see :func:`dynmap_rl.runs.load_source`); written by training.
 
     Raises:
-        ValueError: an unknown supervision or kind, or windows of less than two steps.
+        ValueError: supervision or kind is unknown, or windows have less than two steps.
     """
 
     supervision: str = "position,velocity"
@@ -61,7 +67,7 @@ class DynmapConfig(PreTrainedConfig):
     optimizer_weight_decay: float = 1e-4
     task: str | None = None
     source: dict[str, str] | None = None
-    # None, for the modules hold constants of their own, in weights that are saved with the rest.
+    # The modules hold constants of their own, which are saved with the weights.
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: dict.fromkeys(("VISUAL", "STATE", "ACTION"), NormalizationMode.IDENTITY)
     )
@@ -71,11 +77,11 @@ class DynmapConfig(PreTrainedConfig):
         parse_supervision(self.supervision)
         check_policy(self.kind)
         if self.window_steps < 2:
-            raise ValueError(f"--policy.window_steps must be at least 2, not {self.window_steps}")
+            raise ValueError(f"--policy.window_steps must be at least 2, got {self.window_steps}")
 
     @property
     def camera(self) -> str:
-        """The column of the frames."""
+        """Column of the frames."""
         return next(iter(self.image_features))
 
     @property
@@ -92,7 +98,7 @@ class DynmapConfig(PreTrainedConfig):
 
     @property
     def drop_n_last_frames(self) -> int:
-        """No window begins where it would reach beyond the end of the episode."""
+        """Number of steps at the end of an episode from which no window begins."""
         return self.window_steps - 1
 
     def get_optimizer_preset(self) -> AdamWConfig:
@@ -107,12 +113,15 @@ class DynmapConfig(PreTrainedConfig):
         return CosineAnnealingWithWarmupSchedulerConfig(num_warmup_steps=100)
 
     def validate_features(self) -> None:
-        """Raises ``ValueError`` for anything but one camera of 64 x 64 pixels, a state that ends with the goal x, y,
-        and an action."""
+        """Check for one camera of 64 x 64 pixels, a state that ends with the goal x, y, and an action.
+
+        Raises:
+            ValueError: a feature is missing or has another shape.
+        """
         frame = FRAME_SHAPE[2], *FRAME_SHAPE[:2]
         shapes = [tuple(feature.shape) for feature in self.image_features.values()]
         if shapes != [frame]:
-            raise ValueError(f"dynmap sees one camera of {frame}, not {shapes or 'none'}")
+            raise ValueError(f"dynmap needs one camera of {frame}, got {shapes or 'none'}")
         if self.robot_state_feature is None or self.robot_state_feature.shape[0] < 2:
             raise ValueError("dynmap needs observation.state, whose last two entries are the goal x, y (m)")
         if self.action_feature is None:

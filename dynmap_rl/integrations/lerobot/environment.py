@@ -1,4 +1,4 @@
-"""Our Gymnasium environments as LeRobot's environment ``dynmap``."""
+"""The Gymnasium environments as the LeRobot environment ``dynmap``."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from lerobot.envs.utils import NEW_ROLLOUT_OPTION
 from lerobot.processor import PolicyProcessorPipeline, RenameObservationsProcessorStep
 from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 
-from dynmap_rl.keys import GYMNASIUM_IDS
-from dynmap_rl.data.demonstrations import CAMERA, FRAME_SHAPE
 from dynmap_rl.data.format.writing import FPS
 from dynmap_rl.envs.scene import scene_seed
 from dynmap_rl.envs.world import EPISODE_STEPS
-
+from dynmap_rl.keys import CAMERA, FRAME_SHAPE, GYMNASIUM_IDS
 
 
 @EnvConfig.register_subclass("dynmap")
 @dataclass
 class DynmapEnvConfig(EnvConfig):
-    """``--env.type=dynmap``: observations are named as in our datasets.
+    """Settings of ``--env.type=dynmap``; observations have the names of the datasets' columns.
 
-    Args:
+    Attributes:
         task: ``balance_reaching``, ``balance_reaching_obstacle`` or ``bin_dropping``.
-        fps, episode_length: 20 Hz and 120 steps, which the tasks are defined by.
-        split: of the scenes. ``--seed`` counts within it, so that no evaluation is on scenes of the demonstrations:
-            ``test`` with 0 to 999 are the start states of our tables, ``validation`` is for choosing settings.
+        fps: 20, by definition of the tasks.
+        episode_length: 120, by definition of the tasks.
+        split: split of the scenes. ``--seed`` counts within the split, so that no evaluation uses scenes of the
+            demonstrations: ``test`` with 0 to 999 are the start states of the tables, ``validation`` is for choosing
+            settings.
         render_size: side of the frames of a video, in pixels; an even number.
 
     Raises:
-        ValueError: an unknown task or split, or another length or rate.
+        ValueError: task or split is unknown, or length or rate differ.
     """
 
     task: str | None = "balance_reaching"
@@ -55,25 +55,31 @@ class DynmapEnvConfig(EnvConfig):
 
     def __post_init__(self):
         if self.task not in GYMNASIUM_IDS:
-            raise ValueError(f"--env.task is one of {', '.join(GYMNASIUM_IDS)}, not {self.task!r}")
+            raise ValueError(f"--env.task must be one of {', '.join(GYMNASIUM_IDS)}, got {self.task!r}")
         scene_seed(self.split, 0)
         if (self.fps, self.episode_length) != (FPS, EPISODE_STEPS):
-            raise ValueError(f"episodes of {self.task} have {EPISODE_STEPS} steps at {FPS} Hz")
+            raise ValueError(
+                f"--env.episode_length and --env.fps must be {EPISODE_STEPS} and {FPS}, got {self.episode_length} and "
+                f"{self.fps}"
+            )
 
     @property
     def package_name(self) -> str:
+        """Package that registers the Gymnasium ids."""
         return "dynmap_rl"
 
     @property
     def gym_id(self) -> str:
+        """Gymnasium id of the task."""
         return GYMNASIUM_IDS[self.task]
 
     @property
     def gym_kwargs(self) -> dict:
+        """Arguments of the Gymnasium environment."""
         return {"obs_type": "pixels_agent_pos", "render_mode": "rgb_array", "render_size": self.render_size}
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, VectorEnv]]:
-        """One vector environment of ``n_envs`` scenes, as ``{suite: {number: environments}}``."""
+        """Make one vector environment of ``n_envs`` scenes, as ``{suite: {number: environments}}``."""
         makers = [partial(_make, self.gym_id, self.gym_kwargs, self.split)] * n_envs
         if use_async_envs and n_envs > 1:
             envs = AsyncVectorEnv(makers, context="forkserver", autoreset_mode=AutoresetMode.SAME_STEP)
@@ -82,15 +88,18 @@ class DynmapEnvConfig(EnvConfig):
         return {self.type: {0: envs}}
 
     def get_env_processors(self):
+        """Return the processors that rename the frames' column."""
         # LeRobot calls the frames of an environment with one camera observation.image.
         rename = RenameObservationsProcessorStep({OBS_IMAGE: CAMERA})
         return PolicyProcessorPipeline(steps=[rename]), PolicyProcessorPipeline(steps=[])
 
 
 class _ForLeRobot(gym.Wrapper):
-    """Seeds count within a split. LeRobot's mark of a new rollout is taken from the options of a reset, which are factors
-    of the scene here, and ``info`` has plain values: a vector environment stores NumPy's booleans as objects, None
-    where an episode goes on.
+    """Adapter of resets and ``info`` to LeRobot.
+
+    Seeds count within a split. The mark of a new rollout that LeRobot adds to the options of a reset is removed, since
+    options are factors of the scene here. ``info`` has plain values: a vector environment would store NumPy's booleans
+    as objects.
     """
 
     def __init__(self, env: gym.Env, split: str):

@@ -1,4 +1,4 @@
-"""Run folders of ours as LeRobot's ``pretrained_model`` folders, and back."""
+"""Conversion of run folders to LeRobot's ``pretrained_model`` folders, and back."""
 
 from __future__ import annotations
 
@@ -7,28 +7,31 @@ from pathlib import Path
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.utils.constants import ACTION, OBS_STATE
 
-from dynmap_rl.data.demonstrations import CAMERA, FRAME_SHAPE
-from .configuration_dynmap import DynmapConfig
-from .modeling_dynmap import SIZES, DynmapPolicy
-from .processor_dynmap import make_dynmap_pre_post_processors
+from dynmap_rl.keys import CAMERA, FRAME_SHAPE
 from dynmap_rl.modules.checkpoints import save_policy, save_world_model
 from dynmap_rl.modules.policy import RecurrentPolicy
 from dynmap_rl.runs.lookup import find_run, load_actor
 from dynmap_rl.utils.files import read_json, write_json
 
+from .configuration_dynmap import DynmapConfig
+from .modeling_dynmap import SIZES, DynmapPolicy
+from .processor_dynmap import make_dynmap_pre_post_processors
+
 
 def export_to_lerobot(run: str | Path, folder: str | Path, seed: int = 0) -> Path:
-    """Write world model and policy of a run as ``lerobot-eval --policy.path`` and ``lerobot-train --policy.path`` take
-    them.
+    """Write world model and policy of a run for ``--policy.path`` of LeRobot's commands.
 
     Args:
-        run: a run folder of ours, or its id on the hub (see :func:`dynmap_rl.modules.load_actor`).
-        folder: gets ``config.json``, with the run's task and where its world model is from, ``model.safetensors`` and
-            the processors.
-        seed: of the policy.
+        run: a run (see :func:`dynmap_rl.runs.find_run`).
+        folder: gets ``config.json``, with the task and the origin of the world model, ``model.safetensors`` and the
+            processors.
+        seed: seed of the policy.
+
+    Returns:
+        The folder.
 
     Raises:
-        ValueError: the run holds no such policy, or one of another scene than ours.
+        ValueError: the run has no policy of that seed, or was trained on a robot dataset.
     """
     folder, run = Path(folder), find_run(run)
     actor = load_actor(run, seed)
@@ -36,7 +39,7 @@ def export_to_lerobot(run: str | Path, folder: str | Path, seed: int = 0) -> Pat
     sizes = {"action": policy.action.size, "goal": policy.goal.size}
     sizes |= {name: n.size for name, n in world_model.dynamics_decoder.normalizers.items()}
     if other := {name: size for name, size in sizes.items() if size != SIZES[name]}:
-        raise ValueError(f"{run} is of another scene than ours, by the sizes of {other}")
+        raise ValueError(f"{run} must be a run of one of the tasks, got other sizes: {other}")
     files = run / "config.json", run / "eval.json"
     settings, results = (read_json(file) if file.exists() else {} for file in files)
     config = DynmapConfig(
@@ -64,26 +67,28 @@ def export_to_lerobot(run: str | Path, folder: str | Path, seed: int = 0) -> Pat
 
 
 def import_from_lerobot(folder: str | Path, run: str | Path, seed: int = 0) -> Path:
-    """Write world model and policy of a ``pretrained_model`` folder as a run folder of ours.
+    """Write world model and policy of a ``pretrained_model`` folder as a run folder.
 
-    Its task goes into ``config.json``, and where its world model is from into ``eval.json``, so far as the folder tells
-    them. Results of its own it has none.
+    ``config.json`` gets the task, and ``eval.json`` the origin of the world model, where the folder names them. The run
+    has no results.
 
     Args:
-        folder: of :func:`export_to_lerobot`, or a checkpoint of ``lerobot-train --policy.type=dynmap``.
-        run: gets ``world_model`` and ``seed_N/policy`` too, for ``load_world_model`` and ``load_policy`` of
-            :mod:`dynmap_rl.modules`.
-        seed: that the policy goes by.
+        folder: written by :func:`export_to_lerobot` or by ``lerobot-train --policy.type=dynmap``.
+        run: run folder; gets ``world_model`` and ``seed_N/policy``.
+        seed: seed under which the policy is stored.
+
+    Returns:
+        The run folder.
 
     Raises:
-        ValueError: the folder holds no policy ``dynmap``, or ``run`` is another run's.
+        ValueError: the folder holds no policy ``dynmap``, or ``run`` holds another run.
     """
     folder, run = Path(folder), Path(run)
     if not (folder / "config.json").exists():
         raise ValueError(f"{folder} holds no LeRobot policy (no config.json)")
     config = DynmapConfig.from_pretrained(folder)
     if not isinstance(config, DynmapConfig):
-        raise ValueError(f"{folder} holds a policy of the type {config.type}, not dynmap")
+        raise ValueError(f"{folder} must hold a policy of the type dynmap, got {config.type}")
     source = config.source or {}
     settings = {"task": config.task} | ({"dataset": source["dataset"]} if "dataset" in source else {})
     if (run / "config.json").exists() and read_json(run / "config.json") != settings:

@@ -1,4 +1,4 @@
-"""World model and policy as LeRobot's policy ``dynmap``: joint training on windows, recurrent control."""
+"""World model and policy as the LeRobot policy ``dynmap``: joint training on windows, recurrent control."""
 
 from __future__ import annotations
 
@@ -10,26 +10,28 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from tensordict import TensorDict
 
 from dynmap_rl.data.augmentation import add_distractors, augment
-from .columns import find_constants, find_task, is_symmetric, read_columns
-from .configuration_dynmap import DynmapConfig
-from dynmap_rl.modules.checkpoints import make_policy, make_world_model
 from dynmap_rl.keys import DYNAMICS
+from dynmap_rl.modules.actor import Actor
+from dynmap_rl.modules.checkpoints import make_policy, make_world_model
 from dynmap_rl.modules.precision import mixed_precision
 from dynmap_rl.modules.supervision import parse_supervision
 from dynmap_rl.objectives.joint import JointLoss
 from dynmap_rl.objectives.world_model import WorldModelLoss
 
+from .columns import find_constants, find_task, is_symmetric, read_columns
+from .configuration_dynmap import DynmapConfig
+
 SIZES = {"action": 3, "goal": 2, **dict.fromkeys(DYNAMICS, 6)}
 
 
 class DynmapPolicy(PreTrainedPolicy):
-    """A :class:`dynmap_rl.modules.WorldModel` and the policy that acts on its states.
+    """World model, and the policy that acts on its states.
 
     Args:
         config: settings.
         dataset_stats: LeRobot's statistics; not used.
-        dataset_meta: of the dataset to train on. It gives a new policy the constants of normalisation, which are then
-            saved with the weights, and the targets ``dynamics.*``, which LeRobot does not put into a batch.
+        dataset_meta: metadata of the dataset to train on. It provides the constants of normalisation, which are saved
+            with the weights, and the targets ``dynamics.*``, which LeRobot does not put into a batch.
 
     Raises:
         ValueError: features or columns do not fit.
@@ -65,14 +67,15 @@ class DynmapPolicy(PreTrainedPolicy):
         self.reset()
 
     def get_optim_params(self):
+        """Return the parameters to optimise."""
         return self.parameters()
 
     def reset(self) -> None:
-        """Clear the memory: an episode begins in every environment of the batch."""
-        self._memory = None
+        """Clear the memory, as an episode begins in every environment of the batch."""
+        self._memory: TensorDict | None = None
 
     def forward(self, batch: dict[str, torch.Tensor]) -> tuple[torch.Tensor, dict[str, float]]:
-        """The joint loss on windows ``[B, T]`` from LeRobot's loader, and its terms by name."""
+        """Return the joint loss on windows ``[B, T]`` from LeRobot's loader, and its terms by name."""
         windows = self.make_windows(batch)
         if self.training:
             windows = self._augment(windows)
@@ -80,28 +83,31 @@ class DynmapPolicy(PreTrainedPolicy):
         world_model_loss = WorldModelLoss(
             self.world_model, config.beta_z, config.beta_dynamics, rgb_steps=config.rgb_steps
         )
-        # Made anew, for as an attribute it would save all weights a second time.
+        # As an attribute, the loss module would save all weights a second time.
         loss_module = JointLoss(world_model_loss, self.policy, config.beta_joint, config.emphasis)
         with mixed_precision(windows.device) if config.mixed else nullcontext():
             losses = loss_module(windows)
         return sum(losses.values()), {name: value.item() for name, value in losses.items()}
 
     def make_windows(self, batch: dict[str, torch.Tensor]) -> TensorDict:
-        """A batch of LeRobot's as our losses want it: ``[B, T]`` with ``pixels``, ``action``, ``goal``, ``dynamics``,
-        ``disturbed``, and the mask that is false beyond the end of an episode, which the losses leave out.
+        """Convert a batch of LeRobot's loader to the input of the losses.
+
+        Returns:
+            ``[B, T]`` with ``pixels``, ``action``, ``goal``, ``dynamics``, ``disturbed``, and a mask that is false
+            beyond the end of an episode.
 
         Raises:
             ValueError: the policy was made without a dataset.
         """
         if not self.trainable:
             raise ValueError(
-                "this policy was made without dataset_meta, and so has no dynamics to learn from"
+                "the policy must be made with dataset_meta to be trained, since dynamics are read from the dataset"
             )
         action, beyond = batch[ACTION], batch["action_is_pad"]
         steps = torch.arange(action.shape[1], device=action.device)
         last = (~beyond).sum(1, keepdim=True) - 1
         index = batch["index"].view(-1, 1) + torch.minimum(steps, last)  # (B, T), within the episode
-        rows = torch.searchsorted(self.index, index)  # of a part of a dataset, other files may not be here
+        rows = torch.searchsorted(self.index, index)  # the dataset may be a part
         data = {
             "pixels": to_bytes(batch[self.config.camera]),
             "action": action,
@@ -122,23 +128,20 @@ class DynmapPolicy(PreTrainedPolicy):
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, torch.Tensor], **kwargs) -> torch.Tensor:
-        """The action ``[B, 3]`` (m, m, rad) for the frames ``[B, 3, 64, 64]`` and states ``[B, 5]`` of this step."""
+        """Return the action ``[B, 3]`` (m, m, rad) for frames ``[B, 3, 64, 64]`` and states ``[B, 5]`` of this step."""
         self.eval()
-        pixels, goal = to_bytes(batch[self.config.camera]), batch[OBS_STATE][:, -2:]
-        if self._memory is None:
-            start = len(pixels), pixels.device
-            self._memory = self.world_model.initial_state(*start), self.policy.initial_state(*start)
-        state, policy_state = self._memory
-        latent = self.world_model.encode(pixels, self.config.mixed)
-        action, policy_state = self.policy.step(latent, state[0], state[2], goal, policy_state)
-        self._memory = self.world_model.step(latent, action, state)[1], policy_state
-        return action
+        pixels = to_bytes(batch[self.config.camera])
+        td = TensorDict({}, [len(pixels)]) if self._memory is None else self._memory
+        td = td.set("pixels", pixels).set("goal", batch[OBS_STATE][:, -2:])
+        td = Actor(self.world_model, self.policy, mixed=self.config.mixed)(td)
+        self._memory = td["next"]
+        return td["action"]
 
     def predict_action_chunk(self, batch: dict[str, torch.Tensor], **kwargs) -> torch.Tensor:
-        """A chunk of one action, ``[B, 1, 3]``: each needs the frame before it."""
+        """Return a chunk of one action, ``[B, 1, 3]``, since every action needs a frame."""
         return self.select_action(batch)[:, None]
 
 
 def to_bytes(pixels: torch.Tensor) -> torch.Tensor:
-    """LeRobot's frames in 0..1 as the uint8 that they were."""
+    """Convert LeRobot's frames in 0..1 back to uint8."""
     return pixels if pixels.dtype == torch.uint8 else (pixels * 255).round().to(torch.uint8)

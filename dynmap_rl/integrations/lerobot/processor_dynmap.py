@@ -1,4 +1,4 @@
-"""What stands before and behind the policy ``dynmap``: names, batches and devices, and no normalisation."""
+"""Processors of the policy ``dynmap``: names, batches and devices, without normalisation."""
 
 from __future__ import annotations
 
@@ -8,5 +8,10 @@ from .configuration_dynmap import DynmapConfig
 
 
 def make_dynmap_pre_post_processors(config: DynmapConfig, dataset_stats: dict | None = None):
-    """LeRobot's usual steps. The policy normalises by constants in its own weights, so the statistics are not kept."""
+    """Make LeRobot's default processors; the policy normalises by constants of its own.
+
+    Args:
+        config: settings of the policy.
+        dataset_stats: not used.
+    """
     return make_default_pre_post_processors(config)

@@ -1,3 +1,3 @@
-"""LeRobot imports every installed distribution whose name begins with ``lerobot_policy_``: this registers ours."""
+"""Plugin: LeRobot imports installed distributions named ``lerobot_policy_*``, and this one registers ``dynmap``."""
 
 import dynmap_rl.integrations.lerobot  # noqa: F401
