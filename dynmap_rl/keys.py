@@ -7,3 +7,17 @@ GYMNASIUM_IDS = {  # by task
     "balance_reaching_obstacle": "dynmap_rl/BalanceReachingObstacle-v0",
     "bin_dropping": "dynmap_rl/BinDropping-v0",
 }
+
+CAMERA = "observation.images.front"  # LeRobot column of the frames
+FRAME_SHAPE = (64, 64, 3)  # of a frame in that column: height, width, RGB
+
+NEEDED = {  # columns that every dataset of the tasks has, by the key that they are loaded as
+    "agent_pos": "observation.state",
+    "action": "action",
+    **{("dynamics", name): f"dynamics.{name}" for name in DYNAMICS},
+}
+OPTIONAL = {  # columns that a dataset may lack, likewise
+    ("next", "reward"): "next.reward",
+    ("next", "is_success"): "next.success",
+    "disturbed": "disturbed",
+}

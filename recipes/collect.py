@@ -41,7 +41,7 @@ def main(config: Config) -> None:
     """Record, report and upload."""
     from dynmap_rl.data.demonstrations import META
     from dynmap_rl.data.format.hub import push_dataset
-    from dynmap_rl.data.recording.shards import record_dataset
+    from dynmap_rl.data.recording.record import record_dataset
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.reporting.dataset_page import write_dataset_page
     from dynmap_rl.runs.folder import plain_settings

@@ -1,27 +1,5 @@
-"""Demonstrations: recorded as LeRobot datasets, loaded as one TensorDict, cut into augmented windows."""
+"""Demonstrations: recording them as LeRobot datasets, loading them as TensorDicts, sampling windows of them."""
 
-from .augmentation import add_distractors, augment
-from .demonstrations import load_dataset, load_meta
-from .derive import add_dynamics, differentiate
-from .features import compute_features
-from .format.hub import push_dataset
-from .recording.shards import normalization_constants, record_dataset
-from .replay import as_replay_buffer
-from .robot import load_foreign
-from .windows import sample_windows
+import lazy_loader
 
-__all__ = [
-    "add_distractors",
-    "add_dynamics",
-    "as_replay_buffer",
-    "augment",
-    "compute_features",
-    "differentiate",
-    "load_dataset",
-    "load_foreign",
-    "load_meta",
-    "normalization_constants",
-    "push_dataset",
-    "record_dataset",
-    "sample_windows",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

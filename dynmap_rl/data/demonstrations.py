@@ -1,7 +1,7 @@
-"""LeRobot datasets with dynamics columns as one TensorDict ``[episode, time]``.
+"""Demonstrations of the tasks: LeRobot datasets with dynamics columns as one TensorDict ``[episode, time]``.
 
-The parquet files are read column by column, some ten times faster than frame by frame, and without LeRobot, which
-takes long to import, makes folders for datasets that are not there, and asks the network about damaged ones.
+The parquet files are read column by column, some ten times faster than frame by frame. LeRobot is not imported: its
+import is slow, it creates folders for missing datasets, and it asks the network about damaged ones.
 """
 
 from __future__ import annotations
@@ -15,7 +15,10 @@ import pyarrow as pa
 import torch
 from tensordict import TensorDict
 
+from dynmap_rl.keys import CAMERA, FRAME_SHAPE, NEEDED, OPTIONAL
+
 from .format.reading import (
+    choose_splits,
     decode_image,
     find_dataset,
     image_files,
@@ -25,60 +28,99 @@ from .format.reading import (
     read_split,
     read_table,
 )
+from .normalization import normalization_constants
 
+FORMAT = 3  # version of what is recorded, and how
 META = "meta/dynmap.json"
 RANGE = {"low": [Real], "high": [Real]}
 META_FORM = {
+    "format": int,
     "task": str,
     "kind": str,
     "splits": {"train": [int], "eval": [int]},
     "normalization": dict.fromkeys(("action", "goal", "position", "velocity", "acceleration"), RANGE),
-    "episodes": [{"episode_index": int, "pushes": [[int]]}],
+    "episodes": [{"episode_index": int}],
 }
-CAMERA = "observation.images.front"
-FRAME_SHAPE = (64, 64, 3)  # height, width, RGB
-NEEDED = {
-    "agent_pos": "observation.state",
-    "action": "action",
-    **{("dynamics", name): f"dynamics.{name}" for name in ("position", "velocity", "acceleration")},
-}
-SIZES = {"observation.state": 5, "action": 3} | {name: 6 for name in NEEDED.values() if "dynamics" in name}
-OPTIONAL = {("next", name): f"next.{name}" for name in ("reward", "done", "success")}
+SIZES = {"observation.state": 5, "action": 3, **{NEEDED[key]: 6 for key in NEEDED if "dynamics" in key}}
+SIZES |= dict.fromkeys(OPTIONAL.values(), 1)
 
 
 def load_dataset(dataset: str | Path, split: str | None = None) -> TensorDict:
-    """All episodes of a LeRobot v3.0 dataset, or those of a split, in memory.
+    """Load all episodes of a LeRobot v3.0 dataset, or the episodes of a split, into memory.
+
+    The result has TorchRL's episode data format (TED): observations and action of step t at the root, what follows the
+    action under ``next``. Observations are not repeated under ``next``;
+    ``torchrl.envs.transforms.NextStateReconstructor`` adds the next observations of a sample.
+
+    A row of the result is one trajectory: ``("next", "done")`` and ``("next", "truncated")`` are true at its last step
+    only, and ``terminated`` is never true. Recordings run to the time limit, also after a failure, so that the column
+    ``next.done`` of an exploration can be true earlier.
 
     Args:
-        dataset: a local folder, or the id of a dataset on the Hugging Face hub (``user/name``).
-        split: ``train``, ``eval``, or whichever the dataset's ``info.json`` names.
+        dataset: local folder, or id of a dataset on the Hugging Face hub (``user/name``).
+        split: ``train``, ``eval``, or another split that the dataset's ``info.json`` names.
 
     Returns:
-        ``[E, T]`` with ``pixels`` uint8 ``[E, T, 3, 64, 64]``, ``agent_pos`` ``[E, T, 5]``, ``goal`` ``[E, T, 2]``
-        (the last two of ``agent_pos``), ``action`` ``[E, T, 3]``, ``("dynamics", "position" | "velocity" |
-        "acceleration")`` ``[E, T, 6]`` and, where the dataset has them, ``("next", "reward" | "done" |
-        "success")`` ``[E, T, 1]``: what ``LeRobotDataset`` returns, in SI units. Numbers are float32, flags bool.
-        ``disturbed`` ``[E, T, 1]`` says where a push acted instead of the expert (see ``demonstrations.Plan``).
+        ``[E, T]`` in SI units, numbers as float32, flags as bool:
+
+        - ``pixels`` uint8 ``[E, T, 3, 64, 64]``, ``agent_pos`` ``[E, T, 5]``, ``goal`` ``[E, T, 2]`` (the last two
+          entries of ``agent_pos``), ``action`` ``[E, T, 3]``
+        - ``("dynamics", "position" | "velocity" | "acceleration")`` ``[E, T, 6]``
+        - ``disturbed`` ``[E, T, 1]``: a push acted in the place of the expert; false without such a column
+        - ``("next", "reward" | "is_success")`` ``[E, T, 1]``, where the dataset has the columns ``next.reward`` and
+          ``next.success``
+        - ``done``, ``terminated``, ``truncated`` ``[E, T, 1]``, at the root and under ``next``
+        - ``episode`` int64 ``[E, T]``, the index in the dataset, by which TorchRL's ``SliceSampler`` tells episodes apart,
+          and ``step_count`` int64 ``[E, T, 1]``, the number of the step
 
     Raises:
-        ValueError: there is no such dataset, or it is damaged or of another form. The message says what to do.
+        ValueError: the dataset is missing, damaged, or has another form.
     """
     root = find_dataset(dataset)
     info = read_info(root)
+    find_meta(root)
     columns = _choose_columns(root, info)
     table = read_table(root, info, [CAMERA, *columns.values()])
     if split is not None:
-        table = _select_split(root, info, table, split)
-    shape = _episodes_and_steps(root, table)
-    data = {key: read_column(root, info, table, name).unflatten(0, shape) for key, name in columns.items()}
-    data["goal"] = data["agent_pos"][..., -2:].clone()
-    data["pixels"] = _decode_frames(root, table[CAMERA]).unflatten(0, shape)
-    data["disturbed"] = _mark_pushes(root, table, shape)
-    return TensorDict(data, shape)
+        table = _select_episodes(table, read_split(root, info, split))
+    return _build_episodes(root, info, table, columns)
+
+
+def load_demonstrations(dataset: str | Path) -> tuple[dict[str, TensorDict], dict]:
+    """Load training and held-out episodes, with the constants of normalisation.
+
+    A dataset without ``meta/dynmap.json``, such as one that LeRobot's tools have edited, is accepted: its constants are
+    computed from its training episodes. Without splits ``train`` and ``eval``, every tenth episode is held out, or the
+    last one of fewer than ten.
+
+    Args:
+        dataset: local folder or hub id.
+
+    Returns:
+        The episodes by split, ``train`` and ``eval`` (see :func:`load_dataset`), and the constants (see
+        :func:`dynmap_rl.data.normalization_constants`).
+
+    Raises:
+        ValueError: the dataset is missing, damaged, has another form, or fewer than two episodes.
+    """
+    root = find_dataset(dataset)
+    info = read_info(root)
+    meta = find_meta(root)
+    columns = _choose_columns(root, info)
+    table = read_table(root, info, [CAMERA, *columns.values()])
+    splits = choose_splits(root, info, np.unique(table["episode_index"].to_numpy()).tolist())
+    episodes = {
+        name: _build_episodes(root, info, _select_episodes(table, members), columns)
+        for name, members in splits.items()
+    }
+    return episodes, meta["normalization"] if meta else normalization_constants(episodes["train"])
 
 
 def load_meta(dataset: str | Path) -> dict:
-    """What is known of a recording beside its columns.
+    """Load what a recording says beside its columns.
+
+    Args:
+        dataset: local folder or hub id.
 
     Returns:
         ``format``, ``task``, ``expert``, ``kind``, ``splits`` (name to first episode and the one after the last),
@@ -87,64 +129,88 @@ def load_meta(dataset: str | Path) -> dict:
         ``success``, ``dropped``, ``position_error`` (m).
 
     Raises:
-        ValueError: there is no such dataset, or it is not one of ours.
+        ValueError: the dataset is missing, or is not a recording of this release.
     """
     root = find_dataset(dataset)
-    if not (root / META).exists():
+    if (meta := find_meta(root)) is None:
         read_info(root)
         raise ValueError(
-            f"{dataset} has no {META}, with scenes and normalisation: it is a LeRobot dataset that "
-            "recipes/collect.py did not record; record one, or train on this one with --task none"
+            f"{dataset} must be a recording with {META}, got a dataset without it; record one with "
+            "recipes/collect.py, or train on this one with recipes/robot.py"
+        )
+    return meta
+
+
+def find_meta(root: Path) -> dict | None:
+    """Read ``meta/dynmap.json`` of the dataset in a folder; None where it is missing.
+
+    Raises:
+        ValueError: the file is damaged, or of another release.
+    """
+    if not (root / META).exists():
+        return None
+    meta = read_metadata(root / META)
+    if (version := meta.get("format")) != FORMAT:
+        raise ValueError(
+            f"{root} must be a recording of format {FORMAT}, got format {version}; record it again with "
+            "recipes/collect.py"
         )
     return read_metadata(root / META, META_FORM)
 
 
 def _choose_columns(root: Path, info: dict) -> dict:
-    """Keys of the TensorDict, and the columns they come from."""
+    """Return the columns to load, by key."""
     features = info["features"]
     if missing := [name for name in (CAMERA, *NEEDED.values()) if name not in features]:
         raise ValueError(
-            f"{root} lacks the columns {', '.join(missing)}; add or rename them (dynamics.* are positions, their "
+            f"{root} must have the columns {', '.join(missing)}; add or rename them (dynamics.* are positions, "
             "velocities and accelerations), or record a dataset with recipes/collect.py"
         )
     if (dtype := features[CAMERA]["dtype"]) != "image":
-        raise ValueError(f"{root} stores {CAMERA} as {dtype}; record it as images (use_videos=False)")
+        raise ValueError(f"{CAMERA} of {root} must be image, got {dtype}; record it with use_videos=False")
     if (shape := tuple(features[CAMERA]["shape"])) != FRAME_SHAPE:
-        raise ValueError(f"{root} has frames of {shape}, not {FRAME_SHAPE} (height, width, RGB); resize them")
+        raise ValueError(
+            f"{CAMERA} of {root} must have the shape {FRAME_SHAPE}, got {shape}; resize the frames"
+        )
     for name, size in SIZES.items():
-        if (shape := tuple(features[name]["shape"])) != (size,):
+        if name in features and (shape := tuple(features[name]["shape"])) != (size,):
             raise ValueError(
-                f"{root} has {name} of {shape}, not ({size},): it is of no task of ours; use --task none"
+                f"{name} of {root} must have the shape ({size},), got {shape}; train on other datasets with "
+                "recipes/robot.py"
             )
     return NEEDED | {key: name for key, name in OPTIONAL.items() if name in features}
 
 
-def _select_split(root: Path, info: dict, table: pa.Table, split: str) -> pa.Table:
-    members = read_split(root, info, split)
-    episode = table["episode_index"].to_numpy()
-    return table.filter(pa.array((episode >= members.start) & (episode < members.stop)))
+def _select_episodes(table: pa.Table, members: range | list[int]) -> pa.Table:
+    return table.filter(pa.array(np.isin(table["episode_index"].to_numpy(), members)))
+
+
+def _build_episodes(root: Path, info: dict, table: pa.Table, columns: dict) -> TensorDict:
+    count, steps = shape = _episodes_and_steps(root, table)
+    data = {key: read_column(root, info, table, name).unflatten(0, shape) for key, name in columns.items()}
+    data["goal"] = data["agent_pos"][..., -2:].clone()
+    data["pixels"] = _decode_frames(root, table[CAMERA]).unflatten(0, shape)
+    never = torch.zeros(*shape, 1, dtype=torch.bool)
+    last = never.clone()
+    last[:, -1] = True
+    data["disturbed"] = data.get("disturbed", never).bool()
+    for flag, value in (("done", last), ("terminated", never), ("truncated", last)):
+        data[flag], data["next", flag] = never.clone(), value.clone()
+    data["episode"] = torch.tensor(table["episode_index"].to_numpy()).reshape(shape)
+    data["step_count"] = torch.arange(steps).repeat(count).reshape(count, steps, 1)
+    return TensorDict(data, shape)
 
 
 def _episodes_and_steps(root: Path, table: pa.Table) -> tuple[int, int]:
     _, lengths = np.unique(table["episode_index"].to_numpy(), return_counts=True)
     if not len(lengths) or lengths.min() != lengths.max():
-        found = f"of {lengths.min()} to {lengths.max()} steps" if len(lengths) else "none"
-        raise ValueError(f"{root} must have episodes of equal length, but has {found}; cut or leave out some")
+        found = f"{lengths.min()} to {lengths.max()} steps" if len(lengths) else "no episode"
+        raise ValueError(f"episodes of {root} must have equal lengths, got {found}; cut or remove some")
     return len(lengths), int(lengths[0])
 
 
-def _mark_pushes(root: Path, table: pa.Table, shape: tuple[int, int]) -> torch.Tensor:
-    disturbed = torch.zeros(*shape, 1, dtype=torch.bool)
-    rows = load_meta(root)["episodes"] if (root / META).exists() else []
-    pushes = {row["episode_index"]: row["pushes"] for row in rows}
-    for episode, index in enumerate(table["episode_index"].to_numpy()[:: shape[1]].tolist()):
-        for start, end in pushes.get(index, ()):
-            disturbed[episode, start:end] = True
-    return disturbed
-
-
 def _decode_frames(root: Path, column: pa.ChunkedArray) -> torch.Tensor:
-    """PNG files to uint8 ``[N, 3, 64, 64]``, in threads: the decoder releases the interpreter's lock."""
+    """Decode PNG files to uint8 ``[N, 3, 64, 64]`` in threads: the decoder releases the interpreter's lock."""
     files = image_files(root, CAMERA, column)
     height, width, channels = FRAME_SHAPE
     pixels = np.empty((len(files), channels, height, width), dtype=np.uint8)
@@ -155,7 +221,7 @@ def _decode_frames(root: Path, column: pa.ChunkedArray) -> torch.Tensor:
             try:
                 frame = decode_image(files[row].as_buffer(), height * width)
                 if frame.shape != FRAME_SHAPE:
-                    raise ValueError(f"is {frame.shape}, not {FRAME_SHAPE}")
+                    raise ValueError(f"must have the shape {FRAME_SHAPE}, got {frame.shape}")
             except ValueError as error:
                 raise ValueError(
                     f"{root}: frame {row} {error}; restore the dataset or record it again"

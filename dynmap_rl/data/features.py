@@ -1,4 +1,4 @@
-"""What a frozen world model makes of episodes, computed once: the input of decoupled policy training (Sec. III-B)."""
+"""Latents and hidden states of a frozen world model: the input of decoupled policy training (paper, Sec. III-B)."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tqdm import tqdm
 
-from .augmentation import augment
 from dynmap_rl.modules.world_model import WorldModel
+
+from .augmentation import augment
 
 
 @torch.no_grad()
@@ -19,18 +20,19 @@ def compute_features(
     batch: int = 10,
     recolor: bool = True,
 ) -> TensorDict:
-    """Latents and hidden states of whole episodes, with the actions and goals that go with them.
+    """Compute latents and hidden states of whole episodes.
 
     Args:
-        world_model: frozen; the result is on its device.
-        episodes: ``[E, T]`` with ``pixels``, ``action``, ``goal``, ``dynamics``.
-        copies: so many recoloured versions of every episode follow the plain ones, each from a random step on.
-        generator: of the copies.
-        recolor: false where colours have a meaning, and labels are not those of our tasks.
+        world_model: frozen world model; the result is on its device.
+        episodes: ``[E, T]`` with ``pixels``, ``action``, ``goal``, ``dynamics`` and, optional, ``disturbed``.
+        copies: number of further versions of every episode, each from a random step on.
+        generator: source of the random numbers of the copies, on the device of the world model.
+        batch: number of episodes computed at a time.
+        recolor: permute the colour channels of the copies.
 
     Returns:
-        ``[(1 + copies) E, T]`` with ``latent``, ``hidden1``, ``hidden2``, ``action``, ``goal`` and ``disturbed``: the
-        steps that are no demonstration, by a push or beyond the end.
+        ``[(1 + copies) E, T]`` with ``latent``, ``hidden1``, ``hidden2``, ``action``, ``goal``, and ``disturbed`` bool
+        ``[..., 1]``: steps that imitation leaves out, because a push acted or the episode was over.
     """
     device = next(world_model.parameters()).device
     if "disturbed" not in episodes:
@@ -42,7 +44,7 @@ def compute_features(
             if copy:
                 chunk = _start_anywhere(chunk, generator)
                 if recolor:
-                    # Neither shifted nor mirrored: an obstacle has its place, and an expert may prefer one side.
+                    # No shift and no mirror: an obstacle has its place, and an expert may prefer one side.
                     chunk = augment(chunk, generator, max_shift=0, mirror=False)
             latent = world_model.encode(chunk["pixels"], mixed=True)
             _, hidden1, hidden2 = world_model.predict(latent, chunk["action"])
@@ -54,11 +56,12 @@ def compute_features(
 
 
 def _start_anywhere(episodes: TensorDictBase, generator: torch.Generator) -> TensorDictBase:
-    """Let each episode ``[E, T]`` begin at a random step of its first half, where memory is empty. What is then missing
-    at the end repeats the last step, and is marked as ``disturbed``, which imitation leaves out.
+    """Let each episode ``[E, T]`` begin at a random step of its first half, with empty memory.
 
-    Memory tells the last action, and the next is nearly the same: a policy that only copies it has a low loss, but
-    stands still when control begins. So it must often decide by what it sees.
+    The missing steps at the end repeat the last step and are marked as ``disturbed``.
+
+    Memory holds the last action, and the next action is nearly the same. A policy that copies the last action has a low
+    loss but stands still when control begins. Empty memory makes the policy decide by the frame.
     """
     count, steps = episodes.shape
     device = generator.device

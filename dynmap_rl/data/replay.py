@@ -6,28 +6,33 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import SliceSampler, Storage, TensorDictReplayBuffer, TensorStorage
 
+from .windows import check_length
+
 
 def as_replay_buffer(
     episodes: TensorDictBase, batch: int, length: int, generator: torch.Generator | None = None
 ) -> TensorDictReplayBuffer:
-    """Episodes ``[E, T]`` as a buffer whose ``sample()`` is ``batch`` random windows ``[batch, length]``.
+    """Make a replay buffer of episodes, whose ``sample()`` returns random windows ``[batch, length]``.
 
-    Each window lies in one episode; episodes, and the places in them, are equally likely. The buffer holds the
-    episodes themselves, not a copy; samples are copies, with two entries more, ``[batch, length]``:
-    ``trajectory``, the number of the episode, and ``index``. ``append_transform`` takes any transform of windows,
-    :class:`dynmap_rl.envs.WorldModelTransform` too.
+    Each window lies in one episode; all episodes, and all places in an episode, are equally likely. The buffer holds the
+    episodes themselves, not a copy. Samples are copies, with two more entries: ``trajectory`` ``[batch, length]``, the
+    number of the episode, and ``index``. ``append_transform`` takes any transform of windows, such as
+    :class:`dynmap_rl.envs.WorldModelTransform`.
+
+    Losses on single transitions need next observations, which the episodes do not repeat. For these use TorchRL's own
+    buffer with ``SliceSampler`` and ``NextStateReconstructor`` (see ``dynmap_rl/data/README.md``).
 
     Args:
-        episodes: what :func:`dynmap_rl.data.load_dataset` gave.
-        batch, length: B and T of a sample.
-        generator: of the windows.
+        episodes: ``[E, T]``, as :func:`dynmap_rl.data.load_dataset` returns them.
+        batch: number of windows of a sample.
+        length: steps of a window.
+        generator: source of the random numbers; by default torch's own.
 
     Raises:
         ValueError: the episodes are shorter than ``length``.
     """
     count, steps = episodes.shape
-    if steps < length:
-        raise ValueError(f"windows of {length} steps do not fit into episodes of {steps}")
+    check_length(length, steps)
     number = torch.arange(count, device=episodes.device)[:, None].expand(count, steps)
     flat = episodes.copy().set("trajectory", number).reshape(-1)
     sampler = _WindowSampler(slice_len=length, traj_key="trajectory", truncated_key=None, cache_values=True)
@@ -37,7 +42,7 @@ def as_replay_buffer(
 
 
 class _WindowSampler(SliceSampler):
-    """TorchRL's slices, as windows ``[B, T]`` and not end to end."""
+    """Sampler of TorchRL's slices in the shape ``[B, T]``."""
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[torch.Tensor, dict]:
         (index,), _ = super().sample(storage, batch_size * self.slice_len)

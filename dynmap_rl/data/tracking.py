@@ -1,4 +1,4 @@
-"""Where what moves is in the picture: positions for datasets that have no state."""
+"""Tracking of moving objects in frames: positions for datasets without a state."""
 
 from __future__ import annotations
 
@@ -7,30 +7,30 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-SAMPLES = (
-    51  # frames of an episode that its background is the median of; odd, so that it is one of their values
-)
-WIDEST = 160  # pixels that frames are reduced to: the centroid is finer than a pixel anyhow
+SAMPLES = 51  # frames whose median is the background; odd, so that every median is a value of a frame
+WIDEST = 160  # pixels that frames are reduced to, as the centroid is finer than a pixel
 
 
 def track_centroid(frames: np.ndarray, threshold: int = 30) -> np.ndarray:
-    """The centroid of what differs from the episode's background: ``[T, 2]`` x (right) and y (down), pixels, float64.
+    """Compute the centroid of all pixels that differ from the episode's background.
 
-    The background is the median of frames that are equally far apart not in time but in how much the picture changed,
-    so that something which rests for most of an episode does not become background. Pixels weigh by their difference;
-    specks of less than 3 x 3 pixels are left out; where nothing differs, the last centroid stands, before the first one
-    that one.
+    The background is the median of frames at equal distances in the total change of the picture, not in time, so that an
+    object at rest for most of an episode does not become background. Pixels weigh by their difference. Specks smaller
+    than 3 x 3 pixels are left out. A frame without a difference repeats the last centroid, or the first one to come.
 
-    It is one point for all that moves: arm, object and shadows together. The camera must stand still and the light must
-    not change. What never moves is not seen, and where something stays in one place for most of the change, that place
-    counts as moved when it is empty. It says nothing of depth and nothing of angles.
+    The centroid is one point for all that moves: arm, object and shadows together. The camera must stand still and the
+    light must not change. An object that never moves is not found. A place where an object stays for most of the change
+    counts as moving when the object has left it. Depth and angles are not measured.
 
     Args:
-        frames: of one episode, uint8 ``[T, height, width, 3]``.
-        threshold: difference in any colour channel, of 255, from which on a pixel has changed.
+        frames: frames of one episode, uint8 ``[T, height, width, 3]``.
+        threshold: smallest difference of a colour channel, 0 to 255, of a pixel that moves.
+
+    Returns:
+        ``[T, 2]``, x (right) and y (down) in pixels, float64.
 
     Raises:
-        ValueError: nothing moves.
+        ValueError: nothing moves. The message is the end of a sentence.
     """
     background = _background(frames, threshold)
     centroids = np.full((len(frames), 2), np.nan)
@@ -43,7 +43,7 @@ def track_centroid(frames: np.ndarray, threshold: int = 30) -> np.ndarray:
     seen = ~np.isnan(centroids[:, 0])
     if not seen.any():
         raise ValueError(
-            f"nothing moves: no pixel differs by more than {threshold} of 255; try a lower --threshold"
+            f"nothing moves: no pixel differs by more than {threshold} of 255; use a lower --threshold"
         )
     last = np.maximum.accumulate(np.where(seen, np.arange(len(frames)), np.argmax(seen)))
     return centroids[last]
@@ -57,5 +57,5 @@ def _background(frames: np.ndarray, threshold: int) -> np.ndarray:
 
 
 def _changed(frame: np.ndarray, other: np.ndarray, threshold: int) -> np.ndarray:
-    """The difference of two frames in the channel where it is largest, 0 where it is below the threshold."""
+    """Return the largest difference of two frames over the channels, and 0 where it is below the threshold."""
     return cv2.threshold(cv2.absdiff(frame, other).max(2), threshold, 0, cv2.THRESH_TOZERO)[1]

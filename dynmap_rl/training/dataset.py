@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dynmap_rl.data.demonstrations import META, load_meta
-from dynmap_rl.data.recording.shards import record_dataset
+from dynmap_rl.data.demonstrations import META, find_meta
+from dynmap_rl.data.format.reading import find_dataset
+from dynmap_rl.data.recording.record import record_dataset
 from dynmap_rl.envs.tasks import get_task
 
 
@@ -29,8 +30,12 @@ def find_or_record(task: str, dataset: str | Path | None = None) -> str | Path:
 
 
 def check_dataset(dataset: str | Path, task: str) -> None:
-    """Raise ``ValueError`` if a dataset is of another task, or holds exploration instead of demonstrations."""
-    meta = load_meta(dataset)
+    """Raise ``ValueError`` if a dataset is of another task, or holds exploration instead of demonstrations.
+
+    A dataset without ``meta/dynmap.json``, such as one that LeRobot's tools have edited, is accepted unchecked.
+    """
+    if (meta := find_meta(find_dataset(dataset))) is None:
+        return
     if meta["task"] != task:
         raise ValueError(
             f"{dataset} must be a dataset of {task}, got one of {meta['task']}; choose another --dataset"

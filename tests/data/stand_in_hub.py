@@ -1,7 +1,7 @@
-"""A stand-in for the Hugging Face hub on the loopback interface: as much of it as pushing and pulling takes.
+"""Stand-in for the Hugging Face hub on the loopback interface, with the endpoints for pushing and pulling.
 
-``python stand_in_hub.py`` serves until it is ended and prints its address. Repositories live in memory. ``POST /cut`` makes
-it break off every file of more than 10 kB in the middle, ``POST /mend`` ends that.
+``python stand_in_hub.py`` prints its address and serves until it is ended. Repositories are kept in memory. After
+``POST /cut`` every file of more than 10 kB breaks off in the middle, until ``POST /mend``.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from urllib.parse import unquote
 
 REPOS: dict[str, Repo] = {}
-BLOBS: dict[str, bytes] = {}  # large files by their SHA-256
+BLOBS: dict[str, bytes] = {}  # large files by SHA-256
 CUTTING: list[bool] = []
 LARGE = ".parquet", ".safetensors"
 
@@ -149,7 +149,7 @@ def describe(name: str, content: bytes) -> dict:
 
 
 def changed_files(data: bytes) -> dict[str, bytes | None]:
-    """The files of a commit's lines of JSON; None for those that it deletes."""
+    """Return the files of a commit's lines of JSON; None for deleted files."""
     files = {}
     for line in data.splitlines():
         operation = json.loads(line)

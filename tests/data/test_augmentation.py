@@ -3,11 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDict
 
-from dynmap_rl.data.augmentation import add_distractors
-from dynmap_rl.data.augmentation import augment
-from dynmap_rl.data.windows import sample_windows
+from dynmap_rl.data.augmentation import add_distractors, augment
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 
 
@@ -57,17 +54,16 @@ def test_goal_moves_with_the_cart():
     torch.testing.assert_close(out["apart"].abs(), episodes["apart"].abs(), atol=1e-6, rtol=0)
 
 
-def test_windows_are_pieces_of_episodes():
-    steps = torch.arange(20).expand(5, 20)
-    episodes = TensorDict({"t": steps, "e": torch.arange(5)[:, None].expand(5, 20)}, [5, 20])
-    windows = sample_windows(episodes, 32, 7, torch.Generator().manual_seed(0))
-    assert windows.shape == (32, 7)
-    assert (windows["t"].diff(dim=1) == 1).all()
-    assert (windows["e"] == windows["e"][:, :1]).all()
-    assert (windows["t"][::2, 0] == 0).all()
-    assert len(windows["t"][1::2, 0].unique()) > 4
-    with pytest.raises(ValueError, match="fit"):
-        sample_windows(episodes, 2, 21, torch.Generator())
+def test_options_leave_the_other_changes_as_they_are():
+    episodes = make_episodes(4)
+    every, same_colors = (
+        augment(episodes, torch.Generator().manual_seed(3), recolor=r) for r in (True, False)
+    )
+    assert (every.exclude("pixels") == same_colors.exclude("pixels")).all()
+    assert not torch.equal(every["pixels"], same_colors["pixels"])
+    assert torch.equal(every["pixels"].sum(2), same_colors["pixels"].sum(2)), "channels are permuted"
+    off = augment(episodes, torch.Generator(), max_shift=0, mirror=False, recolor=False)
+    assert (off == episodes.select(*off.keys())).all()
 
 
 # Distractors

@@ -1,6 +1,6 @@
-"""Push, pull, push again and use offline, against a stand-in hub; and what is said when there is none.
+"""Push, pull, push again and use offline, against a stand-in hub, and errors without a hub.
 
-In processes of their own: the hub's client takes its address from the environment when it is imported.
+The tests run in processes of their own: the hub's client reads its address from the environment when it is imported.
 """
 
 import os
@@ -29,7 +29,7 @@ from huggingface_hub import RepoCard, constants
 from lerobot.datasets import LeRobotDataset
 
 from dynmap_rl.data import load_dataset, load_meta
-from dynmap_rl.runs import write_json
+from dynmap_rl.utils.files import write_json
 
 name = "someone/demonstrations"
 
@@ -122,13 +122,7 @@ def run(installed, tmp_path):
 @pytest.mark.slow
 def test_push_a_pull_that_is_cut_off_pull_push_again_and_use_offline(recording, tmp_path, hub, run):
     shutil.copytree(recording, tmp_path / "dataset")
-    printed = run(ONLINE, hub).splitlines()
-    assert printed[0] == "complete already: dataset"
-    assert printed[-3:] == [
-        "done: smaller",
-        "written: runs/collect/smaller/report.html",
-        "pushed: someone/demonstrations",
-    ]
+    assert run(ONLINE, hub).splitlines()[-1] == "pushed: someone/demonstrations"
     run(OFFLINE, hub, offline="1")
     run(OFFLINE, "http://127.0.0.1:9")  # no network, and nobody said so
 
@@ -150,8 +144,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from dynmap_rl.modules import load_actor
-from dynmap_rl.modules.checkpoints import SHIPPED, find_run
+from dynmap_rl.runs.lookup import SHIPPED, find_run, load_actor
 
 run = SHIPPED / "balance_reaching"
 parts = ["config.json", "eval.json", "world_model/*", "seed_*/policy/*", "seed_*/world_model/*"]

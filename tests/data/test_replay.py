@@ -3,9 +3,14 @@
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torchrl.data import SliceSampler, TensorDictReplayBuffer, TensorStorage
+from torchrl.envs.transforms import NextStateReconstructor
+from torchrl.modules import MLP, ValueOperator
+from torchrl.objectives import BCLoss, TD3BCLoss
 
-from dynmap_rl.data.replay import as_replay_buffer
 from dynmap_rl.data.demonstrations import load_dataset
+from dynmap_rl.data.replay import as_replay_buffer
 from dynmap_rl.envs.world_model_transform import WorldModelTransform
 from dynmap_rl.modules.checkpoints import make_world_model
 from dynmap_rl.objectives.world_model import WorldModelLoss
@@ -41,7 +46,7 @@ def test_sampling_again_and_whole_episodes(episodes):
         number = buffer.sample()["number"].squeeze(-1)
         assert (number % 8 == torch.arange(8)).all()
     assert set(episodes.keys()) == {"number", "next"}, "the episodes are left as they are"
-    with pytest.raises(ValueError, match="windows of 9 steps do not fit into episodes of 8"):
+    with pytest.raises(ValueError, match="8 steps.* got 9"):
         as_replay_buffer(episodes, batch=2, length=9)
 
 
@@ -62,3 +67,30 @@ def test_demonstrations_feed_a_loss_and_a_world_model(recording):
     assert sample["latent"].shape == (2, 5, 16) and sample["hidden2"].shape == (2, 5, 24)
     row, time = sample["index"][1].long() // 120, sample["index"][1].long() % 120
     assert torch.equal(episodes["pixels"][row, time], sample["pixels"][1])
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_torchrls_own_buffer_and_losses_take_loaded_episodes(recording):
+    episodes, observed = load_dataset(recording, "train"), ["agent_pos", ("dynamics", "velocity")]
+    rows = TensorStorage(episodes.reshape(-1))
+    sample = TensorDictReplayBuffer(storage=rows, sampler=SliceSampler(slice_len=10), batch_size=200).sample()
+    windows = sample.reshape(20, 10)
+    assert (windows["step_count"].diff(dim=1) == 1).all()
+    assert (windows["episode"] == windows["episode"][:, :1]).all()
+
+    follow = NextStateReconstructor(observed, traj_key="episode", step_count_key="step_count")
+    sampler = SliceSampler(slice_len=10)
+    sample = TensorDictReplayBuffer(storage=rows, sampler=sampler, batch_size=200, transform=follow).sample()
+    sample = sample[sample["next", "agent_pos"].isfinite().all(-1)]  # without the ends of the slices
+    assert len(sample) == 180
+    place = sample["episode"], sample["step_count"][:, 0] + 1
+    for key in observed:
+        expected = episodes[key][place]
+        assert torch.equal(sample["next"][key], expected)
+
+    actor = TensorDictModule(MLP(5, 3, num_cells=[16]), ["agent_pos"], ["action"])
+    critic = ValueOperator(MLP(8, 1, num_cells=[16]), in_keys=["agent_pos", "action"])
+    loss = TD3BCLoss(actor, critic, bounds=(-0.05, 0.05))
+    losses = loss(sample)
+    assert all(losses[name].isfinite() for name in ("loss_actor", "loss_qvalue"))
+    assert BCLoss(actor)(sample)["loss_bc"].isfinite()

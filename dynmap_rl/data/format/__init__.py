@@ -1,1 +1,1 @@
-"""LeRobot v3.0 datasets as files: reading, writing, further columns, frames, the hub."""
+"""LeRobot v3.0 datasets as files: reading, writing, adding columns, frames, the hub."""

@@ -1,7 +1,7 @@
-"""A copy of a LeRobot v3.0 dataset with further columns and their statistics.
+"""Copying of a LeRobot v3.0 dataset with further columns and their statistics.
 
-``lerobot.datasets.dataset_tools.add_features`` writes no statistics of the new columns, neither of the set nor of its
-episodes, is slow where frames are images, and leaves a half-written folder behind when it is stopped.
+``lerobot.datasets.dataset_tools.add_features`` writes no statistics of the new columns, is slow with image columns, and
+leaves an incomplete folder behind when it is stopped.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from .reading import spans
-from .writing import quiet
 from dynmap_rl.utils.files import read_json, write_json
+
+from .quiet import quiet
+from .reading import spans
 
 
 def write_columns(
@@ -29,14 +30,16 @@ def write_columns(
     names: list[str],
     without: tuple[str, ...] = (),
 ) -> None:
-    """Copy the dataset to a new folder, which appears when it is whole, with columns that it gets or that it replaces.
+    """Copy a dataset with new or replaced columns to a new folder, which appears when it is complete.
 
     Args:
-        info: the content of its ``meta/info.json``.
+        root: folder of the dataset.
+        output: the new folder.
+        info: content of the dataset's ``meta/info.json``.
         table: ``index`` and ``episode_index`` of all frames, in order.
-        values: the columns, float32 ``[N, D]``.
-        names: of their entries.
-        without: files that are left out.
+        values: new columns, float32 ``[N, D]``, by name.
+        names: names of the D entries.
+        without: files that are left out, relative to ``root``.
 
     Raises:
         OSError: the folder cannot be written.
@@ -46,9 +49,8 @@ def write_columns(
         shutil.rmtree(temporary, ignore_errors=True)
         for file in sorted(path for path in root.rglob("*") if path.is_file()):
             relative = file.relative_to(root)
-            # Beginning with a dot: the hub's notes on a download.
             if relative.parts[0].startswith(".") or str(relative) in without:
-                continue
+                continue  # names with a dot are the hub's notes on a download
             target = temporary / relative
             target.parent.mkdir(parents=True, exist_ok=True)
             if relative.parts[0] == "data":
@@ -73,7 +75,7 @@ def write_columns(
 
 
 def _write_rows(file: Path, target: Path, index: np.ndarray, values: dict[str, np.ndarray]) -> None:
-    """A data file with the new columns; one row group an episode, as LeRobot writes them."""
+    """Write a data file with the new columns, with one row group for each episode as LeRobot does."""
     with quiet():
         from lerobot.datasets.io_utils import write_table_one_row_group_per_episode
 
@@ -88,7 +90,7 @@ def _write_rows(file: Path, target: Path, index: np.ndarray, values: dict[str, n
 
 
 def _name_columns(rows: pa.Table) -> pa.Table:
-    """Bring the hub's own description of the columns up to date: its viewer refuses others."""
+    """Update the description of the columns for the hub, whose viewer refuses files with an old one."""
     from datasets import Features
 
     if b"huggingface" not in (rows.schema.metadata or {}):
@@ -99,7 +101,7 @@ def _name_columns(rows: pa.Table) -> pa.Table:
 def _write_episodes(
     file: Path, target: Path, rows_of: dict[int, slice], values: dict[str, np.ndarray]
 ) -> None:
-    """The episodes' metadata with their statistics of the new columns."""
+    """Write the episodes' metadata with statistics of the new columns."""
     rows = pq.ParquetFile(file).read()
     old = tuple(f"stats/{name}/" for name in values)
     rows = rows.drop_columns([name for name in rows.column_names if name.startswith(old)])
@@ -120,7 +122,8 @@ def _write_stats(path: Path, values: dict[str, np.ndarray]) -> None:
 def _compute_stats(numbers: np.ndarray) -> dict[str, np.ndarray]:
     from lerobot.datasets.compute_stats import get_feature_stats
 
-    return get_feature_stats(numbers.astype(np.float64), axis=0, keepdims=False)  # float32 is not enough
+    # float32 is not enough for variances.
+    return get_feature_stats(numbers.astype(np.float64), axis=0, keepdims=False)
 
 
 def _link(file: Path, target: Path) -> None:

@@ -1,4 +1,4 @@
-"""Frames of any LeRobot v3.0 dataset, images or videos, one episode after the other."""
+"""Reading of the frames of any LeRobot v3.0 dataset, images or videos, one episode after the other."""
 
 from __future__ import annotations
 
@@ -10,45 +10,53 @@ import cv2
 import numpy as np
 import pyarrow as pa
 
-from .reading import decode_image, image_files, read_file, spans
 from dynmap_rl.utils.hub import first_line
 
-TOLERANCE = 1e-4  # s, LeRobot's own, between a timestamp and the video's frame
-PLACE = "chunk_index", "file_index", "from_timestamp"  # of an episode in the video files
-BLOCK = 100  # frames decoded at a time: full-sized ones of a whole episode may not fit into memory
+from .reading import decode_image, image_files, read_file, spans
+
+TOLERANCE = 1e-4  # s between a timestamp and the video's frame, as in LeRobot
+PLACE = "chunk_index", "file_index", "from_timestamp"  # place of an episode in the video files
+BLOCK = 100  # frames decoded at a time, as a whole episode in full size may not fit into memory
 
 
 def choose_camera(root: Path, info: dict, camera: str | None = None) -> str:
-    """The camera's column, by default the first of the dataset's features.
+    """Return the camera's column, by default the first camera of the dataset.
+
+    Args:
+        root: folder of the dataset, for messages.
+        info: content of its ``meta/info.json``.
+        camera: name of the column, or None.
 
     Raises:
-        ValueError: there is none, or none of that name.
+        ValueError: the dataset has no camera, or no camera of that name.
     """
     cameras = [name for name, f in info["features"].items() if f["dtype"] in ("image", "video")]
     if not cameras:
-        raise ValueError(f"{root} has no camera: no feature is an image or a video")
+        raise ValueError(f"{root} must have an image or video column, got none; choose another dataset")
     if camera not in (None, *cameras):
-        raise ValueError(f"{root} has no camera {camera!r}; choose --camera from {', '.join(cameras)}")
+        raise ValueError(f"--camera must be one of {', '.join(cameras)}, got {camera!r}")
     return camera or cameras[0]
 
 
 def iterate_frames(
     root: Path, info: dict, camera: str, size: tuple[int, int] | None = None, widest: int | None = None
 ) -> Iterator[tuple[int, np.ndarray, float]]:
-    """The frames of every episode.
+    """Iterate over the episodes' frames.
+
+    Frames are reduced with ``cv2.INTER_AREA``, which averages, and enlarged with ``cv2.INTER_LINEAR``.
 
     Args:
-        size: width and height that frames are resized to, whatever their own aspect is.
-        widest: width that frames are reduced to if they are wider, in the place of ``size``.
-
-    Frames are made smaller with ``cv2.INTER_AREA``, which averages, and larger with ``cv2.INTER_LINEAR``.
+        root: folder of the dataset.
+        info: content of its ``meta/info.json``.
+        camera: column of the frames.
+        size: width and height that frames are resized to, whatever their own aspect.
+        widest: width that wider frames are reduced to, in place of ``size``.
 
     Yields:
-        The episode's index, its frames uint8 ``[T, height, width, 3]`` (RGB), and the width that they had over the one
-        they have now.
+        The episode's index, its frames uint8 ``[T, height, width, 3]`` (RGB), and the ratio of stored to returned width.
 
     Raises:
-        ValueError: a file is damaged; the message names it.
+        ValueError: a file is damaged; the message names the file.
     """
     video = info["features"][camera]["dtype"] == "video"
     episodes = _read_episodes(root, camera) if video else {}
@@ -71,7 +79,7 @@ def iterate_frames(
 
 
 def _read_episodes(root: Path, camera: str) -> dict[int, dict]:
-    """Where each episode's frames are in the video files."""
+    """Read the place of every episode in the video files."""
     files = sorted((root / "meta" / "episodes").glob("*/*.parquet"))
     names = ["episode_index", *(f"videos/{camera}/{key}" for key in PLACE)]
     return {row["episode_index"]: row for file in files for row in read_file(file, names).to_pylist()}
@@ -95,7 +103,7 @@ def _decode(file: Path, camera: str, rows: pa.Table, largest: int) -> Iterator[l
 def _decode_video(
     root: Path, info: dict, episodes: dict, camera: str, rows: pa.Table
 ) -> Iterator[np.ndarray]:
-    from .writing import quiet
+    from .quiet import quiet
 
     with quiet():
         from lerobot.datasets.video_utils import decode_video_frames
@@ -107,17 +115,17 @@ def _decode_video(
         times = start + rows["timestamp"].to_numpy().astype(np.float64)
     except (AttributeError, LookupError, TypeError, ValueError) as error:
         raise ValueError(
-            f"{root} does not say where its videos are ({error}); restore the dataset"
+            f"{root} must have the place of its videos in meta, got none that can be read ({error}); restore the dataset"
         ) from error
     if path.is_absolute() or ".." in path.parts:
-        raise ValueError(f"{root} names a video outside of itself, {path}; restore the dataset")
+        raise ValueError(f"video_path of {root} must be inside the dataset, got {path}; restore the dataset")
     path = root / path
     for start in range(0, len(times), BLOCK):
         some = times[start : start + BLOCK].tolist()
         try:
             # PyAV comes with its own FFmpeg; torchcodec needs the system's.
             frames = decode_video_frames(path, some, TOLERANCE, backend="pyav", return_uint8=True)
-        except Exception as error:  # of LeRobot or of the FFmpeg below it
+        except Exception as error:  # LeRobot and FFmpeg below it raise many kinds
             reason = first_line(error)
             raise ValueError(f"{path} cannot be decoded ({reason}); restore the dataset") from error
         yield frames.permute(0, 2, 3, 1).numpy()

@@ -1,4 +1,4 @@
-"""A recording on its way to the Hugging Face hub: its card, its picture, and the tag by which LeRobot finds it."""
+"""Upload of recordings to the Hugging Face hub, with a card, a picture and the tag by which LeRobot finds them."""
 
 from __future__ import annotations
 
@@ -8,13 +8,15 @@ import cv2
 import numpy as np
 from tensordict import TensorDict
 
-from ..demonstrations import META, load_dataset, load_meta
-from .writing import FPS, quiet
 from dynmap_rl.envs.world import CONTROL_DT, EPISODE_STEPS
 from dynmap_rl.utils.hub import first_line
 
+from ..demonstrations import META, load_dataset, load_meta
+from .quiet import quiet
+from .writing import FPS
+
 PICTURE = "picture.png"
-FOLDERS = ["data/", "meta/", "videos/", "images/"]  # of a LeRobot dataset
+FOLDERS = ["data/", "meta/", "videos/", "images/"]  # all that a LeRobot dataset can have
 PAPER = "Visual Imitation Learning of Non-Prehensile Manipulation Tasks with Dynamics-Supervised Models"
 CITATION = f"""\
 @misc{{mustafa_dynamics_mapping,
@@ -28,7 +30,7 @@ DESCRIPTION = """\
 "{instruction}" A cart carries a free-standing block over a scene of 1 m x 1 m: {episodes} episodes of {steps} steps
 at {fps} Hz.
 
-![The first episodes, a row each]({picture})
+![The first episodes, one in each row]({picture})
 
 How it was made: PyMunk simulates, pygame draws, {maker}. The command was
 `python recipes/{command}`.
@@ -39,22 +41,27 @@ How it was made: PyMunk simulates, pygame draws, {maker}. The command was
 | `observation.state` | 5 | commanded cart pose x, y, theta (m, m, rad) and goal x, y (m) |
 | `action` | 3 | change of the commanded cart pose in one step (m, m, rad) |
 | `next.reward`, `next.done`, `next.success` | 1 | after the action |
+| `disturbed` | 1 | a push acted in this step: not to be imitated |
 | `dynamics.position` | 6 | cart x, y, theta, block x, y, theta (m, m, rad) |
 | `dynamics.velocity` | 6 | its rate, as the simulator has it (m/s, rad/s) |
 | `dynamics.acceleration` | 6 | change of velocity since the last step over {dt} s (m/s^2, rad/s^2); 0 at the start |
 
-`{meta}` holds the splits ({splits}), constants for normalisation, and scene, seed and expert of every episode."""
+`{meta}` holds the splits ({splits}), constants of normalisation, and scene, seed and expert of every episode."""
 
 
 def push_dataset(root: str | Path, repo_id: str) -> None:
-    """Upload a recording to the Hugging Face hub; what is there already is not sent again, and the files of an earlier
-    recording that this one does not have are deleted there.
+    """Upload a recording to the Hugging Face hub, with a card and a picture.
 
-    A card (what it is, columns with units, license, paper) and a picture go with it.
+    Files that are there already are not sent again. Files of an earlier recording under the same id are deleted. The
+    card has the content, the columns with units, the license and the paper.
+
+    Args:
+        root: folder of the recording.
+        repo_id: id on the hub (``user/name``).
 
     Raises:
-        ValueError: the folder is no recording of ours.
-        OSError: the hub refuses it or cannot be reached.
+        ValueError: the folder is not a recording.
+        OSError: the hub refuses the upload or cannot be reached.
     """
     meta = load_meta(root)
     with quiet():
@@ -66,7 +73,7 @@ def push_dataset(root: str | Path, repo_id: str) -> None:
             dataset = LeRobotDataset(repo_id, root=root, video_backend="pyav")
             draw_episodes(load_dataset(root, "train"), Path(root) / PICTURE)
             HfApi().create_repo(**hub, exist_ok=True)
-            # LeRobot's own upload would leave stale files; after this one it has the card and the tag to add.
+            # LeRobot's own upload would leave stale files. After this upload it only adds the card and the tag.
             HfApi().upload_folder(
                 **hub, folder_path=root, ignore_patterns=["images/"], delete_patterns=FOLDERS
             )
@@ -78,7 +85,7 @@ def push_dataset(root: str | Path, repo_id: str) -> None:
                 url="https://github.com/Automation-Research-Team/DynamicsMapping-2D (the paper's)",
                 citation_bibtex=CITATION,
             )
-        except Exception as error:  # of the hub's client, or of the HTTP library below it
+        except Exception as error:  # the hub's client and the HTTP library below it raise many kinds
             reason = first_line(error)
             raise OSError(
                 f"cannot push {root} to {repo_id} ({reason}); check the name, the network, and `hf auth login`"
@@ -86,12 +93,23 @@ def push_dataset(root: str | Path, repo_id: str) -> None:
 
 
 def draw_episodes(episodes: TensorDict, path: Path, rows: int = 3, columns: int = 8, zoom: int = 2) -> None:
-    """Frames of the first episodes ``[E, T]``, evenly spaced in time, a row each."""
+    """Draw frames of the first episodes ``[E, T]``, evenly spaced in time, one episode in each row.
+
+    Args:
+        episodes: ``[E, T]`` with ``pixels``.
+        path: image file to write.
+        rows: number of episodes.
+        columns: number of frames of each.
+        zoom: pixels of the image for each pixel of a frame.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
     steps = np.linspace(0, episodes.shape[1] - 1, columns).round().astype(int)
     frames = episodes["pixels"][:rows, steps].permute(0, 3, 1, 4, 2)  # row, y, column, x, RGB
     picture = frames.flatten(2, 3).flatten(0, 1).numpy().repeat(zoom, 0).repeat(zoom, 1)
     if not cv2.imwrite(str(path), picture[..., ::-1]):
-        raise OSError(f"{path} cannot be written")
+        raise OSError(f"{path} cannot be written; is there space, and may the folder be written?")
 
 
 def _describe(meta: dict, instruction: str) -> str:
@@ -101,11 +119,11 @@ def _describe(meta: dict, instruction: str) -> str:
     collect += f" --expert {meta['expert']}" if meta["expert"] != task else ""
     maker, command = {
         "demonstrations": (
-            "state-based PPO experts act; successful episodes, most with short pushes",
+            "state-based PPO experts act; all episodes succeed, most with short pushes",
             collect,
         ),
         "exploration": ("state-based PPO experts act, with noise and detours", collect),
-        "human": ("a person drives; successful episodes", f"play.py --task {task} --record FOLDER"),
+        "human": ("a person drives; all episodes succeed", f"play.py --task {task} --record FOLDER"),
     }[kind]
     return DESCRIPTION.format(
         kind="Demonstrations of a person" if kind == "human" else kind.capitalize(),

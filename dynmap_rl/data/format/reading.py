@@ -1,4 +1,4 @@
-"""LeRobot v3.0 datasets as they lie in a folder: where it is, its metadata, its columns and images."""
+"""Reading of LeRobot v3.0 datasets: finding the folder, metadata, columns and images."""
 
 from __future__ import annotations
 
@@ -24,7 +24,12 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def find_dataset(dataset: str | Path) -> Path:
-    """The local folder of a dataset; one named by a hub id is downloaded, or found in LeRobot's cache when offline.
+    """Return the local folder of a dataset.
+
+    A dataset named by a hub id is downloaded. Without a network it is found in LeRobot's cache.
+
+    Args:
+        dataset: local folder or hub id.
 
     Raises:
         ValueError: there is neither such a folder nor such a dataset on the hub.
@@ -38,17 +43,14 @@ def find_dataset(dataset: str | Path) -> Path:
     from huggingface_hub import snapshot_download
     from lerobot.utils.constants import HF_LEROBOT_HUB_CACHE
 
+    place = {"repo_type": "dataset", "revision": LEROBOT_VERSION, "cache_dir": HF_LEROBOT_HUB_CACHE}
     try:
-        return Path(
-            snapshot_download(
-                dataset, repo_type="dataset", revision=LEROBOT_VERSION, cache_dir=HF_LEROBOT_HUB_CACHE
-            )
-        )
+        return Path(snapshot_download(dataset, **place))
     except (
         OSError,
         ValueError,
         HTTPError,
-    ) as error:  # every error of the hub's client, or of the network below it
+    ) as error:  # all errors of the hub's client and of the network below it
         reason = first_line(error)
         raise ValueError(
             f"no dataset at {dataset}, neither as a folder nor with the tag {LEROBOT_VERSION} on the hub ({reason}); "
@@ -57,10 +59,14 @@ def find_dataset(dataset: str | Path) -> Path:
 
 
 def read_metadata(path: Path, form=dict) -> dict:
-    """A JSON file of a dataset, which has a form (see :func:`dynmap_rl.runs.check_form`).
+    """Read a JSON file of a dataset.
+
+    Args:
+        path: the file.
+        form: structure that the value must have (see :func:`dynmap_rl.utils.files.check_form`).
 
     Raises:
-        ValueError: it is damaged, not there, or of another form.
+        ValueError: the file is missing, damaged, or of another structure.
     """
     try:
         value = json.loads(path.read_text())
@@ -73,20 +79,21 @@ def read_metadata(path: Path, form=dict) -> dict:
 
 
 def read_info(root: Path) -> dict:
-    """``meta/info.json``: features, splits, numbers of episodes and frames.
+    """Read ``meta/info.json``: features, splits, numbers of episodes and frames.
 
     Raises:
-        ValueError: the folder is no LeRobot dataset, or one of another version.
+        ValueError: the folder is not a LeRobot dataset, or a dataset of another version.
     """
     path = root / "meta" / "info.json"
     if not path.exists():
         raise ValueError(
-            f"{root} is not a LeRobot dataset (no meta/info.json); record one with recipes/collect.py"
+            f"{root} must be a LeRobot dataset, got a folder without meta/info.json; record one with "
+            "recipes/collect.py"
         )
     info = read_metadata(path)
     if (version := info.get("codebase_version")) != LEROBOT_VERSION:
         raise ValueError(
-            f"{root} is of LeRobot's format {version}, not {LEROBOT_VERSION}; convert it with LeRobot's script"
+            f"{root} must be of LeRobot's format {LEROBOT_VERSION}, got {version}; convert it with LeRobot's script"
         )
     check_form(info, INFO, str(path))
     check_form(info.get("splits") or {}, {str: str}, f"{path}, splits")
@@ -94,28 +101,55 @@ def read_info(root: Path) -> dict:
 
 
 def read_split(root: Path, info: dict, name: str) -> range:
-    """The episodes of a split.
+    """Return the episodes of a split.
 
     Raises:
-        ValueError: the dataset does not name it, or not as ``FIRST:END``.
+        ValueError: the dataset does not name the split, or not as ``FIRST:END``.
     """
     if name not in (splits := info.get("splits") or {}):
-        raise ValueError(f"{root} has no split {name!r}; choose from {sorted(splits)}")
+        raise ValueError(f"split of {root} must be one of {sorted(splits)}, got {name!r}; choose another")
     try:
         first, end = map(int, splits[name].split(":"))
     except ValueError as error:
         raise ValueError(
-            f"{root} has a split {name} {splits[name]!r}, not FIRST:END; restore its meta/info.json"
+            f"split {name} of {root} must be FIRST:END, got {splits[name]!r}; restore its meta/info.json"
         ) from error
     return range(first, end)
 
 
-def read_file(file: Path, columns: list[str]) -> pa.Table:
-    """Columns of one parquet file.
+def choose_splits(root: Path, info: dict, episodes: list[int]) -> dict[str, list[int]]:
+    """Divide episodes into ``train`` and ``eval``.
+
+    Args:
+        root: folder of the dataset.
+        info: content of its ``meta/info.json``. Splits ``train`` and ``eval`` named there are kept; otherwise every
+            tenth episode is held out, or the last one of fewer than ten.
+        episodes: indices to choose from.
 
     Raises:
-        ValueError: it is damaged, lacks a column (which PyArrow leaves out without a word), or counts by other than
-            whole numbers.
+        ValueError: there are fewer than two episodes, or a named split is empty.
+    """
+    if {"train", "eval"} <= (info.get("splits") or {}).keys():
+        members = {name: read_split(root, info, name) for name in ("train", "eval")}
+        splits = {name: [e for e in episodes if e in members[name]] for name in members}
+    else:
+        held_out = episodes[9::10] or episodes[-1:]
+        splits = {"train": [e for e in episodes if e not in held_out], "eval": held_out}
+    if not all(splits.values()):
+        found = ", ".join(f"{len(members)} in {name}" for name, members in splits.items())
+        raise ValueError(
+            f"{root} must have an episode of sufficient length in each of the splits train and eval, got {found}; use "
+            "shorter windows, or record more episodes"
+        )
+    return splits
+
+
+def read_file(file: Path, columns: list[str]) -> pa.Table:
+    """Read columns of one parquet file.
+
+    Raises:
+        ValueError: the file is damaged, lacks a column (which PyArrow leaves out without an error), or has an index
+            that is not a whole number.
     """
     try:
         table = pq.ParquetFile(file).read(columns)
@@ -125,16 +159,23 @@ def read_file(file: Path, columns: list[str]) -> pa.Table:
         ) from error
     if missing := [name for name in columns if name not in table.column_names]:
         raise ValueError(
-            f"{file} lacks the columns {', '.join(missing)}; restore it or record the dataset again"
+            f"{file} must have the columns {', '.join(missing)}; restore it or record the dataset again"
         )
     for name in {"index", "episode_index"} & {*columns}:
         if not pa.types.is_integer(table.schema.field(name).type) or table[name].null_count:
-            raise ValueError(f"{file} has no whole numbers in {name}; restore it or record the dataset again")
+            raise ValueError(
+                f"{name} of {file} must be whole numbers; restore it or record the dataset again"
+            )
     return table
 
 
 def read_table(root: Path, info: dict, columns: list[str]) -> pa.Table:
-    """These columns of all data files, and ``index`` and ``episode_index``, in order of time.
+    """Read columns of all data files, with ``index`` and ``episode_index``, in order of time.
+
+    Args:
+        root: folder of the dataset.
+        info: content of its ``meta/info.json``.
+        columns: names of the columns.
 
     Raises:
         ValueError: a file is damaged, or columns or frames are missing.
@@ -144,37 +185,56 @@ def read_table(root: Path, info: dict, columns: list[str]) -> pa.Table:
     try:
         table = pa.concat_tables(tables) if tables else []
     except pa.ArrowException as error:
-        raise ValueError(f"{root} has data files of different columns ({error}); record it again") from error
+        raise ValueError(
+            f"data files of {root} must have the same columns, got others ({error}); record it again"
+        ) from error
     if not len(table) or len(table) != info["total_frames"]:
         raise ValueError(
-            f"{root} is incomplete: {len(table)} of {info['total_frames']} frames; restore it or record it again"
+            f"{root} must have {info['total_frames']} frames, got {len(table)}; restore it or record it again"
         )
     return table.sort_by("index")
 
 
 def read_column(root: Path, info: dict, table: pa.Table, name: str, dtype=np.float32) -> torch.Tensor:
-    """A column's numbers ``[N, D]`` as memory of their own.
+    """Copy the numbers of a column.
+
+    Args:
+        root: folder of the dataset, for messages.
+        info: content of its ``meta/info.json``.
+        table: rows of the dataset (see :func:`read_table`).
+        name: the column.
+        dtype: type of the result, except for columns of flags.
+
+    Returns:
+        ``[N, D]``, bool for a column of flags.
 
     Raises:
-        ValueError: some are missing or not finite, or there are not as many as ``meta/info.json`` says.
+        ValueError: numbers are missing or not finite, or a row has not as many as ``meta/info.json`` says.
     """
     flat = table[name].combine_chunks()
     while pa.types.is_list(flat.type) or pa.types.is_fixed_size_list(flat.type):
         flat = flat.flatten()
     values = flat.to_numpy(zero_copy_only=False)
     if values.dtype.kind not in "biuf" or table[name].null_count or not np.isfinite(values).all():
-        raise ValueError(f"{root} has numbers in {name} that are missing or not finite; record it again")
+        raise ValueError(
+            f"{name} of {root} must be finite numbers, got others or missing ones; record it again"
+        )
     size = math.prod(info["features"][name]["shape"]) if name in info["features"] else 1
     if len(values) != size * len(table):
-        raise ValueError(f"{root} does not have {size} numbers in every row of {name}; record it again")
+        raise ValueError(f"{name} of {root} must have {size} numbers in every row; record it again")
     return torch.from_numpy(values.astype(bool if values.dtype == bool else dtype)).reshape(-1, size)
 
 
 def image_files(where: Path, name: str, column: pa.ChunkedArray) -> pa.Array:
-    """The image files in a camera's column, which is of the dataset or the file ``where``.
+    """Return the image files of a camera's column.
+
+    Args:
+        where: dataset or file of the column, for messages.
+        name: the column's name.
+        column: its values.
 
     Raises:
-        ValueError: it holds no files.
+        ValueError: the column does not hold files.
     """
     array = column.combine_chunks()
     try:
@@ -182,32 +242,39 @@ def image_files(where: Path, name: str, column: pa.ChunkedArray) -> pa.Array:
     except (AttributeError, KeyError):
         files = None
     if files is None or not pa.types.is_binary(files.type):
-        raise ValueError(f"{where} holds no image files in {name}; restore it or record it again")
+        raise ValueError(f"{name} of {where} must hold image files; restore it or record it again")
     return files
 
 
 def spans(episode: np.ndarray) -> list[tuple[int, slice]]:
-    """Each episode's index, and its rows."""
+    """Return the index of every episode and its rows."""
     borders = [0, *(np.flatnonzero(np.diff(episode)) + 1).tolist(), len(episode)]
     return [(int(episode[a]), slice(a, b)) for a, b in pairwise(borders)]
 
 
 def decode_image(file: pa.Buffer | None, largest: int) -> np.ndarray:
-    """An image file's uint8 ``[height, width, 3]`` (RGB).
+    """Decode an image file.
+
+    Args:
+        file: content of the file.
+        largest: largest number of pixels allowed, as a small file can hold a huge picture.
+
+    Returns:
+        uint8 ``[height, width, 3]`` (RGB).
 
     Raises:
-        ValueError: it cannot be decoded, or has more pixels than ``largest``: a small file can hold a huge picture.
+        ValueError: the file cannot be decoded, or has too many pixels. The message is the end of a sentence.
     """
     data = np.frombuffer(file or b"", np.uint8)
     try:
         if data[:8].tobytes() == PNG and data.size >= 24:
             width, height = data[16:24].view(">u4").tolist()
-        else:  # which takes as long as decoding a small PNG
+        else:  # takes as long as decoding a small PNG
             width, height = Image.open(io.BytesIO(data)).size
     except (OSError, Image.DecompressionBombError) as error:
         raise ValueError("cannot be decoded") from error
     if width * height > largest:
-        raise ValueError(f"has {width} x {height} pixels, more than the dataset says")
+        raise ValueError(f"must have at most {largest} pixels, got {width} x {height}")
     frame = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB)
     if frame is None:
         raise ValueError("cannot be decoded")

@@ -1,20 +1,21 @@
-"""Rollouts as LeRobot v3.0 files: the columns, the writing, the merging."""
+"""Writing of rollouts as LeRobot v3.0 datasets, and merging of such datasets."""
 
 from __future__ import annotations
 
 import contextlib
-import io
-import logging
 from pathlib import Path
-from unittest import mock
 
 import numpy as np
 from tensordict import TensorDict
 
-from ..demonstrations import CAMERA, NEEDED, OPTIONAL, load_dataset
 from dynmap_rl.envs.world import CONTROL_DT, EPISODE_STEPS
+from dynmap_rl.keys import CAMERA
 
-LOCAL_ID = "dynmap_rl/recording"  # LeRobot wants an id; it is stored nowhere
+from ..demonstrations import load_dataset
+from .quiet import quiet
+from .reading import read_column, read_info, read_table
+
+LOCAL_ID = "dynmap_rl/recording"  # LeRobot needs an id; it is not stored
 FPS = round(1 / CONTROL_DT)
 
 POSE = ["cart_x", "cart_y", "cart_theta"]
@@ -26,6 +27,7 @@ FEATURES = {
     "next.reward": {"dtype": "float32", "shape": (1,), "names": ["reward"]},
     "next.done": {"dtype": "bool", "shape": (1,), "names": ["done"]},
     "next.success": {"dtype": "bool", "shape": (1,), "names": ["success"]},
+    "disturbed": {"dtype": "bool", "shape": (1,), "names": ["disturbed"]},
     "dynamics.position": {"dtype": "float32", "shape": (6,), "names": BODIES},
     "dynamics.velocity": {"dtype": "float32", "shape": (6,), "names": BODIES},
     "dynamics.acceleration": {"dtype": "float32", "shape": (6,), "names": BODIES},
@@ -33,10 +35,16 @@ FEATURES = {
 
 
 def write_episodes(folder: Path, episodes: TensorDict, instruction: str) -> None:
-    """Write rollouts ``[E, T]`` (see ``demonstrations.roll_out``) as a new dataset, and read it back.
+    """Write rollouts as a new dataset, and read it back.
+
+    Args:
+        folder: folder of the dataset, which must not exist.
+        episodes: ``[E, 120]`` with the entries of :func:`dynmap_rl.data.recording.plans.roll_out` and ``disturbed`` bool
+            ``[E, 120, 1]``.
+        instruction: the task in one sentence.
 
     Raises:
-        OSError: the disk does not hold what was written.
+        OSError: the folder does not hold what was written.
     """
     columns = _to_columns(episodes)
     with quiet():
@@ -49,7 +57,7 @@ def write_episodes(folder: Path, episodes: TensorDict, instruction: str) -> None
             for t in range(EPISODE_STEPS):
                 frame = {name: values[episode, t] for name, values in columns.items()}
                 dataset.add_frame({**frame, "task": instruction})
-            # Statistics are computed in the buffer's precision, and float32 is not enough for variances.
+            # LeRobot computes statistics in the buffer's precision, and float32 is not enough for variances.
             buffer = dataset.writer.episode_buffer
             for name in columns:
                 if FEATURES[name]["dtype"] == "float32":
@@ -58,39 +66,37 @@ def write_episodes(folder: Path, episodes: TensorDict, instruction: str) -> None
                 dataset.save_episode()
         dataset.finalize()
     written = load_dataset(folder)
-    # LeRobot only logs that a frame could not be written.
-    for key in ("pixels", "agent_pos", "action", "dynamics"):
+    # LeRobot only logs a frame that could not be written.
+    for key in ("pixels", "agent_pos", "action", "dynamics", "disturbed"):
         if not (written[key] == episodes[key]).all():
-            raise OSError(f"{folder} does not hold the {key} that were written to it")
+            raise OSError(f"{key} of {folder} must be as written, got other values; check the disk")
 
 
 def merge_datasets(folders: list[Path], into: Path, splits: dict[str, list[int]]) -> TensorDict:
-    """Merge datasets into a new one, with statistics of all of its frames, and read that.
+    """Merge datasets into a new one, with statistics of all of its frames, and load that.
 
     Args:
-        splits: name to first episode and the one after the last.
+        folders: datasets to merge, in this order.
+        into: folder of the new dataset, which must not exist.
+        splits: first episode and the one after the last, by name.
 
     Returns:
-        All episodes, as :func:`load_dataset` returns them.
+        All episodes, as :func:`dynmap_rl.data.load_dataset` returns them.
     """
     with quiet(), _embedding_in_batches():
         import datasets
-        from lerobot.datasets import LeRobotDataset
         from lerobot.datasets.aggregate import aggregate_datasets
-        from lerobot.datasets.io_utils import load_info, write_info, write_stats
+        from lerobot.datasets.io_utils import load_info, load_stats, write_info, write_stats
 
-        # Not the user's cache: a copy of every shard would stay in it.
-        cache = str(into.with_name("cache.tmp"))
-        with mock.patch.object(datasets.config, "HF_DATASETS_CACHE", cache):
+        # Not the user's cache, which would keep a copy of every shard.
+        with _replaced(datasets.config, "HF_DATASETS_CACHE", str(into.with_name("cache.tmp"))):
             aggregate_datasets([LOCAL_ID] * len(folders), LOCAL_ID, folders, into, concatenate_data=False)
-            dataset = LeRobotDataset(LOCAL_ID, root=into, video_backend="pyav")
         info = load_info(into)
         info.splits = {name: f"{first}:{end}" for name, (first, end) in splits.items()}
         write_info(info, into)
-        episodes = load_dataset(into)
-        stats = dataset.meta.stats | _compute_stats(episodes)
+        stats = load_stats(into) | _compute_stats(into)
         write_stats({name: stats[name] for name in sorted(stats)}, into)
-    return episodes
+    return load_dataset(into)
 
 
 def _to_columns(episodes: TensorDict) -> dict[str, np.ndarray]:
@@ -101,28 +107,31 @@ def _to_columns(episodes: TensorDict) -> dict[str, np.ndarray]:
         "next.reward": episodes["next", "reward"],
         "next.done": episodes["next", "done"],
         "next.success": episodes["next", "is_success"],
+        "disturbed": episodes["disturbed"],
         **{f"dynamics.{name}": values for name, values in episodes["dynamics"].items()},
     }
     return {name: values.numpy() for name, values in columns.items()}
 
 
-def _compute_stats(episodes: TensorDict) -> dict[str, dict[str, np.ndarray]]:
-    """Of all numbers at once, in float64.
+def _compute_stats(root: Path) -> dict[str, dict[str, np.ndarray]]:
+    """Compute the statistics of all numbers at once, in float64.
 
-    LeRobot's merging averages the quantiles of the episodes: those of a goal, which is constant in an episode, would
-    all be its mean.
+    LeRobot's merging averages the quantiles of the episodes. A goal is constant in an episode: all of its quantiles
+    would be its mean.
     """
     from lerobot.datasets.compute_stats import get_feature_stats
 
+    info, names = read_info(root), [name for name in FEATURES if name != CAMERA]
+    table = read_table(root, info, names)
     return {
-        name: get_feature_stats(episodes[key].flatten(0, 1).double().numpy(), axis=0, keepdims=False)
-        for key, name in (NEEDED | OPTIONAL).items()
+        name: get_feature_stats(read_column(root, info, table, name).double().numpy(), axis=0, keepdims=False)
+        for name in names
     }
 
 
 @contextlib.contextmanager
 def _embedding_in_batches():
-    """LeRobot puts the images of an episode into the table row by row; all at once takes half the time."""
+    """Embed the images of an episode in one batch, in half the time that LeRobot takes row by row."""
     from datasets.table import embed_table_storage
     from lerobot.datasets import dataset_writer, io_utils
 
@@ -131,24 +140,18 @@ def _embedding_in_batches():
         return embedded.with_format(**dataset.format)
 
     with (
-        mock.patch.object(io_utils, "embed_images", embed_images, create=True),
-        mock.patch.object(dataset_writer, "embed_images", embed_images, create=True),
+        _replaced(io_utils, "embed_images", embed_images),
+        _replaced(dataset_writer, "embed_images", embed_images),
     ):
         yield
 
 
 @contextlib.contextmanager
-def quiet():
-    """Hold back progress bars and notes of LeRobot and datasets, above all the page on missing video decoders."""
-    import datasets
-
-    disabled, bars = logging.root.manager.disable, datasets.are_progress_bars_disabled()
-    logging.disable(logging.WARNING)
-    datasets.disable_progress_bars()
+def _replaced(module, name: str, value):
+    """Set an attribute of a module until the end of the block."""
+    before = getattr(module, name)
+    setattr(module, name, value)
     try:
-        with contextlib.redirect_stderr(io.StringIO()):
-            yield
+        yield
     finally:
-        logging.disable(disabled)
-        if not bars:
-            datasets.enable_progress_bars()
+        setattr(module, name, before)

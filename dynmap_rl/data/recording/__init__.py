@@ -1,1 +1,1 @@
-"""Recordings of experts and of persons, in shards that survive a kill."""
+"""Recording of experts and of persons: plans of episodes, shards, and their merging."""

@@ -1,4 +1,4 @@
-"""Rollouts of the shipped experts: what a demonstration is, before it is written anywhere (paper, Sec. IV-C)."""
+"""Plans of episodes, and rollouts of experts by these plans (paper, Sec. IV-C)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import torch
 from tensordict import TensorDict
 
 from dynmap_rl.envs.scene import scene_seed
-from dynmap_rl.envs.tasks import BalanceReaching, get_task
+from dynmap_rl.envs.task import Task
+from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.envs.world import ACTION_LIMIT, EPISODE_STEPS, World
 from dynmap_rl.experts.network import list_checkpoints, load_expert
@@ -27,15 +28,15 @@ KEYS = [
 
 @dataclass(frozen=True)
 class Plan:
-    """How one episode is made.
+    """Recipe of one episode.
 
     Attributes:
-        scene_seed: draws the scene.
+        scene_seed: seed of the scene.
         checkpoint: the expert's checkpoint.
         noise: standard deviation of the noise on the expert's acceleration, in units of its own exploration.
-        detours: goals other than the scene's that the expert is sent to first.
-        pushes: spans ``(start, end)`` of steps in which not the expert acts but a push towards a random velocity,
-            or to a stop, so that the demonstration shows how to recover. Imitation leaves these steps out.
+        detours: number of other goals that the expert is sent to before the scene's goal.
+        pushes: spans ``(start, end)`` of steps in which a push towards a random velocity, or to a stop, acts in the
+            place of the expert, so that the demonstration shows how to recover. Imitation leaves these steps out.
     """
 
     scene_seed: int
@@ -48,7 +49,15 @@ class Plan:
 def plan_demonstrations(
     task: str, split: str, start: int, count: int, expert: str | Path | None = None
 ) -> list[Plan]:
-    """Candidates ``start .. start + count`` of a split: the checkpoints in turn, two of three episodes with pushes."""
+    """Plan demonstrations with the checkpoints in turn; two of three episodes have pushes.
+
+    Args:
+        task: name of the task.
+        split: split of the scenes (see :func:`dynmap_rl.envs.scene.scene_seed`).
+        start: number of the first scene in the split.
+        count: number of episodes.
+        expert: folder or task of the expert's checkpoints; by default the expert that ships for the task.
+    """
     checkpoints = list_checkpoints(expert or task)
     plans = []
     for i in range(start, start + count):
@@ -61,7 +70,15 @@ def plan_demonstrations(
 def plan_exploration(
     task: str, split: str, start: int, count: int, expert: str | Path | None = None
 ) -> list[Plan]:
-    """Episodes that are no demonstrations: noisy experts that are sent to other places than the goal."""
+    """Plan episodes of noisy experts on detours, which are not to be imitated.
+
+    Args:
+        task: name of the task.
+        split: split of the scenes (see :func:`dynmap_rl.envs.scene.scene_seed`).
+        start: number of the first scene in the split.
+        count: number of episodes.
+        expert: folder or task of the expert's checkpoints; by default the expert that ships for the task.
+    """
     checkpoints = list_checkpoints(expert or task)
     return [
         Plan(scene_seed(split, i), checkpoints[i % len(checkpoints)], noise=(0.5, 1.0, 2.0)[i % 3], detours=3)
@@ -74,12 +91,12 @@ def roll_out(task: str, plans: list[Plan], expert: str | Path | None = None) -> 
 
     Args:
         task: name of the task.
-        plans: one an episode.
-        expert: whose checkpoints the plans name; by default the one that ships for the task.
+        plans: one plan for each episode.
+        expert: folder or task of the checkpoints that the plans name; by default the expert that ships for the task.
 
     Returns:
-        A TensorDict ``[E, 120]``: ``pixels``, ``agent_pos``, ``goal``, ``dynamics``, ``action`` as executed, and
-        under ``next`` ``reward``, ``done``, ``is_success``, ``dropped``, ``position_error``.
+        ``[E, 120]`` with ``pixels``, ``agent_pos``, ``goal``, ``dynamics``, ``action`` as executed, and under ``next``
+        ``reward``, ``done``, ``is_success``, ``dropped``, ``position_error``.
     """
     n = len(plans)
     env = DynmapBatchedEnv(task, n, from_pixels=True)
@@ -103,8 +120,17 @@ def roll_out(task: str, plans: list[Plan], expert: str | Path | None = None) -> 
     return torch.stack(steps, 1)
 
 
-def _state_for(task: BalanceReaching, world: World, goal: np.ndarray) -> np.ndarray:
-    """The state as if the goal were another."""
+def mark_pushes(plans: list[Plan]) -> torch.Tensor:
+    """Return the steps in which a push acts, bool ``[E, 120, 1]``."""
+    disturbed = torch.zeros(len(plans), EPISODE_STEPS, 1, dtype=torch.bool)
+    for row, plan in enumerate(plans):
+        for start, end in plan.pushes:
+            disturbed[row, start:end] = True
+    return disturbed
+
+
+def _state_for(task: Task, world: World, goal: np.ndarray) -> np.ndarray:
+    """Return the state that the world would have with another goal."""
     own, world.goal = world.goal, goal
     state = task.state(world)
     world.goal = own
@@ -112,7 +138,7 @@ def _state_for(task: BalanceReaching, world: World, goal: np.ndarray) -> np.ndar
 
 
 def _expert_acceleration(state, plans, networks, rngs) -> np.ndarray:
-    # Row by row: on some CPUs the last bits of a product of matrices depend on the number of rows, and an episode is to
+    # Row by row: on some CPUs the last bits of a product of matrices depend on the number of rows, and an episode must
     # be the same in any batch.
     out = np.empty((len(plans), 3))
     for row, plan in enumerate(plans):
@@ -122,7 +148,7 @@ def _expert_acceleration(state, plans, networks, rngs) -> np.ndarray:
 
 
 def _push(t: int, action: np.ndarray, plans: list[Plan]) -> None:
-    """Put the pushes in the place of the actions; every other one brings the cart to a stop."""
+    """Replace actions by pushes; every other push brings the cart to a stop."""
     for row, plan in enumerate(plans):
         for number, (start, end) in enumerate(plan.pushes):
             if start <= t < end:
@@ -131,14 +157,14 @@ def _push(t: int, action: np.ndarray, plans: list[Plan]) -> None:
 
 
 def _draw_pushes(scene_seed: int, number: int) -> tuple[tuple[int, int], ...]:
-    """So many pushes, most of them early, while the cart is on its way."""
+    """Draw spans of pushes, most of them early, while the cart is on its way."""
     rng = np.random.default_rng([scene_seed, 2])
     starts = np.sort(rng.exponential(30, number).astype(int).clip(0, EPISODE_STEPS - 25))
     return tuple((int(t), int(t + rng.integers(2, 7))) for t in starts)
 
 
 def _detour_goals(plans: list[Plan], rngs) -> np.ndarray:
-    """``[E, 120, 2]`` goals of the detours (m), each for 20 to 40 steps from the start; NaN afterwards."""
+    """Draw goals ``[E, 120, 2]`` of the detours (m), each for 20 to 40 steps from the start; NaN afterwards."""
     goals = np.full((len(plans), EPISODE_STEPS, 2), np.nan)
     for row, (plan, rng) in enumerate(zip(plans, rngs, strict=True)):
         t = 0

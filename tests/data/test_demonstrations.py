@@ -1,4 +1,4 @@
-"""What is loaded is what LeRobot reads, and what cannot be loaded is named."""
+"""Loaded demonstrations equal what LeRobot reads; damaged datasets are refused by name."""
 
 import json
 import shutil
@@ -9,19 +9,16 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
-from dynmap_rl.data.demonstrations import load_dataset
-from dynmap_rl.data.demonstrations import load_meta
-from dynmap_rl.data.demonstrations import CAMERA
-from dynmap_rl.data.demonstrations import NEEDED
-from dynmap_rl.data.demonstrations import OPTIONAL
+from dynmap_rl.data.demonstrations import load_dataset, load_demonstrations, load_meta
+from dynmap_rl.data.format.quiet import quiet
+from dynmap_rl.data.normalization import normalization_constants
+from dynmap_rl.keys import CAMERA, DYNAMICS, NEEDED, OPTIONAL
 
 
 def test_equals_what_lerobot_reads(recording):
-    from lerobot.datasets import LeRobotDataset
-
-    from dynmap_rl.data.format.writing import quiet
-
     with quiet():
+        from lerobot.datasets import LeRobotDataset
+
         dataset = LeRobotDataset("local/recording", root=recording, video_backend="pyav")
     frames = load_dataset(recording).flatten(0, 1)
     assert len(dataset) == len(frames) == 6 * 120
@@ -36,20 +33,37 @@ def test_equals_what_lerobot_reads(recording):
 
 def test_shapes_and_types(recording):
     episodes = load_dataset(recording)
+    flags = ("done", "terminated", "truncated")
     expected = {
         "pixels": ((6, 120, 3, 64, 64), torch.uint8),
         "agent_pos": ((6, 120, 5), torch.float32),
         "goal": ((6, 120, 2), torch.float32),
         "action": ((6, 120, 3), torch.float32),
-        **{("dynamics", k): ((6, 120, 6), torch.float32) for k in ("position", "velocity", "acceleration")},
+        **{("dynamics", k): ((6, 120, 6), torch.float32) for k in DYNAMICS},
+        "disturbed": ((6, 120, 1), torch.bool),
         ("next", "reward"): ((6, 120, 1), torch.float32),
-        ("next", "done"): ((6, 120, 1), torch.bool),
-        ("next", "success"): ((6, 120, 1), torch.bool),
+        ("next", "is_success"): ((6, 120, 1), torch.bool),
+        **{flag: ((6, 120, 1), torch.bool) for flag in flags},
+        **{("next", flag): ((6, 120, 1), torch.bool) for flag in flags},
+        "episode": ((6, 120), torch.int64),
+        "step_count": ((6, 120, 1), torch.int64),
     }
+    assert set(episodes.keys(True, True)) == set(expected)
     for key, (shape, dtype) in expected.items():
         assert (tuple(episodes[key].shape), episodes[key].dtype) == (shape, dtype), key
         assert episodes[key].is_contiguous()
     assert torch.equal(episodes["goal"], episodes["agent_pos"][..., 3:])
+
+
+def test_every_episode_is_one_trajectory_cut_off_at_its_end(recording):
+    episodes = load_dataset(recording)
+    for flag in ("done", "truncated"):
+        assert episodes["next", flag][:, -1].all() and not episodes["next", flag][:, :-1].any()
+        assert not episodes[flag].any()
+    assert not episodes["terminated"].any() and not episodes["next", "terminated"].any()
+    held_out = load_dataset(recording, "eval")
+    assert held_out["episode"][:, 0].tolist() == [4, 5]
+    assert held_out["step_count"][0].flatten().tolist() == list(range(120))
 
 
 def test_splits_are_the_parts_of_the_whole(recording):
@@ -58,13 +72,13 @@ def test_splits_are_the_parts_of_the_whole(recording):
     assert (train.shape[0], evaluation.shape[0]) == (4, 2)
     for key in whole.keys(True, True):
         assert torch.equal(torch.cat([train[key], evaluation[key]]), whole[key])
-    with pytest.raises(ValueError, match=r"no split 'test'; choose from \['eval', 'train'\]"):
+    with pytest.raises(ValueError, match="'test'"):
         load_dataset(recording, "test")
 
 
 def test_a_split_that_names_no_episodes_is_refused(copy):
     change_info(copy, lambda info: info.update(splits={"train": "all"}))
-    with pytest.raises(ValueError, match="copy has a split train 'all', not FIRST:END"):
+    with pytest.raises(ValueError, match="copy must be FIRST:END, got 'all'"):
         load_dataset(copy, "train")
 
 
@@ -188,32 +202,30 @@ def blank(height, width, kind=".png"):
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (not_lerobot, "not a LeRobot dataset"),
+        (not_lerobot, "must be a LeRobot dataset"),
         (broken_json, "info.json cannot be read"),
-        (old_version, "format v2.1, not v3.0; convert"),
-        (no_dynamics, "lacks the columns dynamics.velocity; add"),
-        (video, "as video; record it as images"),
-        (other_size, r"frames of \(96, 96, 3\)"),
+        (old_version, "v2.1"),
+        (no_dynamics, "dynamics.velocity"),
+        (video, "must be image, got video"),
+        (other_size, r"got \(96, 96, 3\)"),
         (truncated, "damaged or unfinished data file"),
-        (missing_file, "is incomplete"),
-        (no_files, "is incomplete: 0 of 720 frames"),
-        (unequal_lengths, "of 119 to 120 steps"),
-        (nan, "action that are missing or not finite"),
-        (empty_row, "next.reward that are missing or not finite"),
-        (another_column("action", [0.0] * 4), "does not have 3 numbers in every row of action"),
-        (another_column("next.reward", "much"), "next.reward that are missing or not finite"),
-        (another_column("index", 0.5), "no whole numbers in index"),
-        (another_column(CAMERA, 0), f"holds no image files in {CAMERA}"),
+        (missing_file, "must have 720 frames, got 480"),
+        (no_files, "must have 720 frames, got 0"),
+        (unequal_lengths, "119 to 120 steps"),
+        (nan, "action"),
+        (empty_row, "next.reward"),
+        (another_column("action", [0.0] * 4), "action of .* must have 3 numbers"),
+        (another_column("next.reward", "much"), "next.reward"),
+        (another_column("index", 0.5), "index of .* must be whole numbers"),
+        (another_column(CAMERA, 0), f"{CAMERA} of .* must hold image files"),
         (another_frame(lambda png: png[:20], "broken_frame"), "frame 3 cannot be decoded"),
-        (another_frame(lambda png: png[:40], "truncated_frame"), "frame 3 cannot be decoded"),
         (another_frame(lambda png: b"", "no_frame"), "frame 3 cannot be decoded"),
-        (another_frame(lambda png: blank(32, 64), "small_frame"), r"frame 3 is \(32, 64, 3\)"),
-        (another_frame(lambda png: blank(1, 64), "one_line"), r"frame 3 is \(1, 64, 3\)"),
+        (another_frame(lambda png: blank(32, 64), "small_frame"), r"frame 3 must .* \(32, 64, 3\)"),
         (
             another_frame(lambda png: blank(4000, 3000), "huge_frame"),
-            "frame 3 has 3000 x 4000 pixels, more than",
+            "frame 3 must .* 3000 x 4000",
         ),
-        (another_frame(lambda png: blank(400, 300, ".jpg"), "huge_jpeg"), "frame 3 has 300 x 400 pixels"),
+        (another_frame(lambda png: blank(400, 300, ".jpg"), "huge_jpeg"), "frame 3 must .* 300 x 400"),
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )
@@ -233,11 +245,35 @@ def test_a_missing_dataset_is_named_and_not_created(tmp_path, monkeypatch, name)
 
 
 def test_a_dataset_of_others_has_no_metadata_but_can_be_loaded(copy):
+    """As LeRobot's editor leaves a recording, or as a user's own dataset is."""
+    pushed = load_dataset(copy)["disturbed"]
     (copy / "meta" / "dynmap.json").unlink()
-    for name in ("reward", "done", "success"):
-        change_info(copy, lambda info, name=name: info["features"].pop(f"next.{name}"))
-    with pytest.raises(ValueError, match="has no meta/dynmap.json"):
+    with pytest.raises(ValueError, match=r"meta/dynmap\.json"):
         load_meta(copy)
+    assert torch.equal(load_dataset(copy)["disturbed"], pushed) and pushed.any()
+    for name in ("next.reward", "next.done", "next.success", "disturbed"):
+        change_info(copy, lambda info, name=name: info["features"].pop(name))
     episodes = load_dataset(copy)
-    assert "next" not in episodes.keys()
+    assert "reward" not in episodes["next"].keys() and episodes["next", "done"].sum() == 6
     assert not episodes["disturbed"].any()
+
+
+def test_demonstrations_are_both_splits_and_the_constants(recording, copy):
+    episodes, constants = load_demonstrations(recording)
+    for split in ("train", "eval"):
+        assert (episodes[split] == load_dataset(recording, split)).all()
+    assert constants == load_meta(recording)["normalization"]
+    (copy / "meta" / "dynmap.json").unlink()
+    assert load_demonstrations(copy)[1] == constants == normalization_constants(episodes["train"])
+    change_info(copy, lambda info: info.update(splits={"train": "0:6"}))
+    parts, constants = load_demonstrations(copy)
+    assert parts["eval"]["episode"][:, 0].tolist() == [5], "the last is held out"
+    assert constants == normalization_constants(parts["train"])
+
+
+def test_a_recording_of_the_first_release_is_refused_with_what_to_do(copy):
+    path = copy / "meta" / "dynmap.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"format": 2}))
+    for load in (load_dataset, load_demonstrations, load_meta):
+        with pytest.raises(ValueError, match=r"format 2; .*recipes/collect\.py"):
+            load(copy)

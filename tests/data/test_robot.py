@@ -1,16 +1,16 @@
-"""Datasets of no task of ours: pieces, splits, frames and constants."""
+"""Robot datasets: pieces, splits, frames and constants."""
 
 import json
+import shutil
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
-from foreign_dataset import CAMERA, make_foreign
+from robot_dataset import CAMERA, make_robot_dataset
 
 from dynmap_rl.data.derive import add_dynamics
-from dynmap_rl.data.robot import load_foreign
-from dynmap_rl.data.robot import range_constants
+from dynmap_rl.data.robot import load_robot_dataset
 from dynmap_rl.data.windows import sample_windows
 
 LENGTHS = (31, 47, 24, 33)
@@ -19,9 +19,9 @@ LENGTHS = (31, 47, 24, 33)
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory):
     """By name: without dynamics, with them, and the same with frames in videos."""
-    root = tmp_path_factory.mktemp("foreign")
-    make_foreign(root / "plain", LENGTHS)
-    make_foreign(root / "plain_videos", LENGTHS, videos=True)
+    root = tmp_path_factory.mktemp("robot")
+    make_robot_dataset(root / "plain", LENGTHS)
+    make_robot_dataset(root / "plain_videos", LENGTHS, videos=True)
     for name in ("plain", "plain_videos"):
         add_dynamics(root / name, root / name.replace("plain", "dynamics"), columns=[0, 1, 2], angles=[2])
     return root
@@ -29,7 +29,7 @@ def folders(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def splits(folders):
-    return load_foreign(folders / "dynamics", 20)
+    return load_robot_dataset(folders / "dynamics", 20)[0]
 
 
 def column(root, name):
@@ -73,20 +73,20 @@ def test_no_episode_is_in_both_splits(splits):
 
 
 def test_splits_that_the_dataset_names_are_kept(folders, tmp_path):
-    root = make_foreign(tmp_path / "named", (12, 12, 12))
+    root = make_robot_dataset(tmp_path / "named", (12, 12, 12))
     path = root / "meta/info.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"splits": {"eval": "0:1", "train": "1:3"}}))
-    splits = load_foreign(root, 5)
+    splits, _ = load_robot_dataset(root, 5)
     assert splits["eval"]["episode"].unique().tolist() == [0]
     assert splits["train"]["episode"].unique().tolist() == [1, 2]
 
 
 def test_episodes_that_are_too_short_are_left_out_and_long_ones_cut(tmp_path):
-    root = make_foreign(tmp_path / "lengths", (130, 8, 125))
-    splits = load_foreign(root, 20)
+    root = make_robot_dataset(tmp_path / "lengths", (130, 8, 125))
+    splits, _ = load_robot_dataset(root, 20)
     assert splits["train"].shape == (2, 120)
-    with pytest.raises(ValueError, match="has 1 episodes of at least 128 steps, and two are needed"):
-        load_foreign(root, 128)
+    with pytest.raises(ValueError, match="lengths must"):
+        load_robot_dataset(root, 128)
 
 
 def test_frames_are_resized_by_area_and_keep_their_colours(splits):
@@ -100,13 +100,13 @@ def test_frames_are_resized_by_area_and_keep_their_colours(splits):
 
 
 def test_videos_give_nearly_the_frames_of_images(folders, splits):
-    videos = load_foreign(folders / "dynamics_videos", 20)["train"]
+    videos = load_robot_dataset(folders / "dynamics_videos", 20)[0]["train"]
     assert (videos["pixels"].float() - splits["train"]["pixels"]).abs().mean() < 2
     assert torch.equal(videos["action"], splits["train"]["action"])
 
 
 def test_a_goal_of_chosen_entries(folders):
-    train = load_foreign(folders / "plain", 20, goal="observation.state:3,0")["train"]
+    train = load_robot_dataset(folders / "plain", 20, goal="observation.state:3,0")[0]["train"]
     assert train["goal"].shape == (5, 24, 2)
     assert (train["goal"][..., 0] == 0).all()
     assert train["goal"][0, 0, 1].item() == column(folders / "plain", "observation.state")[0, 0]
@@ -114,7 +114,7 @@ def test_a_goal_of_chosen_entries(folders):
 
 
 def test_constants_are_the_ranges_and_a_still_entry_gets_one(folders, splits):
-    constants = range_constants(splits["train"])
+    _, constants = load_robot_dataset(folders / "dynamics", 20)
     assert constants.keys() == {"action", "goal", "position", "velocity", "acceleration"}
     for key in ("action", ("dynamics", "position")):
         values = splits["train"][key].flatten(0, 1)
@@ -122,56 +122,49 @@ def test_constants_are_the_ranges_and_a_still_entry_gets_one(folders, splits):
         low, high = torch.tensor(constants[name]["low"]), torch.tensor(constants[name]["high"])
         assert (((values - low) / (high - low) - 0.5).abs() < 0.53).all()
         assert (high - low <= values.amax(0) - values.amin(0) + 1e-6).all()
-    goals = load_foreign(folders / "plain", 20, goal="observation.state:3")["train"]
-    assert range_constants(goals)["goal"] == {"low": [-0.5], "high": [0.5]}
+    _, constants = load_robot_dataset(folders / "plain", 20, goal="observation.state:3")
+    assert constants["goal"] == {"low": [-0.5], "high": [0.5]}
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"camera": "front"}, f"no camera 'front'; choose --camera from {CAMERA}"),
-        ({"goal": "observation.state"}, "--goal: after the colon are whole numbers"),
-        ({"goal": "nothing:1"}, "--goal is a column of numbers and its entries"),
-        ({"goal": "observation.state:4"}, "observation.state has the entries 0 to 3"),
+        ({"camera": "front"}, f"--camera .*{CAMERA}"),
+        ({"goal": "observation.state"}, "--goal"),
+        ({"goal": "nothing:1"}, "--goal .*nothing:1"),
+        ({"goal": "observation.state:4"}, "--goal.* 0 to 3, got 4"),
     ],
 )
 def test_what_is_not_there_is_named(folders, arguments, message):
     with pytest.raises(ValueError, match=message):
-        load_foreign(folders / "plain", 20, **arguments)
+        load_robot_dataset(folders / "plain", 20, **arguments)
 
 
 def test_a_video_outside_of_the_dataset_is_not_opened(folders, tmp_path):
-    import json
-    import shutil
-
     root = shutil.copytree(folders / "plain_videos", tmp_path / "copy")
     info = json.loads((root / "meta/info.json").read_text())
     (root / "meta/info.json").write_text(json.dumps(info | {"video_path": "../" + info["video_path"]}))
-    with pytest.raises(ValueError, match="names a video outside of itself"):
-        load_foreign(root, 20)
+    with pytest.raises(ValueError, match="video_path"):
+        load_robot_dataset(root, 20)
 
 
 def test_videos_that_are_nowhere_are_named(folders, tmp_path):
-    import shutil
-
     root = shutil.copytree(folders / "plain_videos", tmp_path / "copy")
     path = root / "meta/info.json"
     info = json.loads(path.read_text())
-    for place in (None, "{nothing}", "videos/{video_key.nothing}", "{"):
+    for place in (None, "{nothing}"):
         path.write_text(json.dumps(info | {"video_path": place}))
-        with pytest.raises(ValueError, match="copy does not say where its videos are"):
-            load_foreign(root, 20)
+        with pytest.raises(ValueError, match="place of its videos"):
+            load_robot_dataset(root, 20)
     path.write_text(json.dumps(info))
     shutil.rmtree(root / "meta/episodes")
-    with pytest.raises(ValueError, match="copy does not say where its videos are"):
-        load_foreign(root, 20)
+    with pytest.raises(ValueError, match="place of its videos"):
+        load_robot_dataset(root, 20)
 
 
 def test_a_damaged_video_is_named(folders, tmp_path):
-    import shutil
-
     root = shutil.copytree(folders / "plain_videos", tmp_path / "copy")
     [path] = root.rglob("*.mp4")
     path.write_bytes(path.read_bytes()[:500])
     with pytest.raises(ValueError, match=f"{path} cannot be decoded"):
-        load_foreign(root, 20)
+        load_robot_dataset(root, 20)

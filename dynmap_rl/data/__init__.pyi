@@ -1,0 +1,16 @@
+from .augmentation import add_distractors as add_distractors
+from .augmentation import augment as augment
+from .demonstrations import load_dataset as load_dataset
+from .demonstrations import load_demonstrations as load_demonstrations
+from .demonstrations import load_meta as load_meta
+from .derive import add_dynamics as add_dynamics
+from .derive import differentiate as differentiate
+from .features import compute_features as compute_features
+from .format.hub import push_dataset as push_dataset
+from .normalization import normalization_constants as normalization_constants
+from .recording.record import record_dataset as record_dataset
+from .replay import as_replay_buffer as as_replay_buffer
+from .robot import describe_robot_dataset as describe_robot_dataset
+from .robot import load_robot_dataset as load_robot_dataset
+from .settings import Augmentation as Augmentation
+from .windows import sample_windows as sample_windows

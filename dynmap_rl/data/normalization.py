@@ -1,0 +1,59 @@
+"""Constants that map actions, goals and dynamics to [-1, 1]."""
+
+from __future__ import annotations
+
+import numpy as np
+from tensordict import TensorDictBase
+
+from dynmap_rl.envs.world import ACCELERATION_LIMIT, ACTION_LIMIT, VELOCITY_LIMIT
+
+
+def normalization_constants(episodes: TensorDictBase) -> dict[str, dict[str, list[float]]]:
+    """Compute the range of every quantity of the tasks, from the scene's natural scales.
+
+    The natural ranges are the scene (0 to 1 m), half a radian, and the cart's limits of action, speed and
+    acceleration, which are used for the block too. A range is widened about its middle where more than one in a
+    thousand of the values lie beyond.
+
+    Args:
+        episodes: ``[E, T]`` training episodes, as :func:`dynmap_rl.data.load_dataset` returns them.
+
+    Returns:
+        ``low`` and ``high`` ``[D]`` of action, goal, position, velocity and acceleration, in SI units.
+    """
+    natural = {  # middle and half width
+        "action": (0.0, ACTION_LIMIT),
+        "goal": (0.5, np.full(2, 0.5)),
+        "position": (np.tile([0.5, 0.5, 0.0], 2), np.full(6, 0.5)),
+        "velocity": (0.0, np.tile(VELOCITY_LIMIT, 2)),
+        "acceleration": (0.0, np.tile(ACCELERATION_LIMIT, 2)),
+    }
+    constants = {}
+    for name, (middle, half) in natural.items():
+        values = episodes[name if name in ("action", "goal") else ("dynamics", name)]
+        reach = np.abs(values.flatten(0, 1).double().numpy() - middle)  # [N, D]
+        half = np.maximum(half, np.quantile(reach, 0.999, axis=0))
+        constants[name] = {"low": (middle - half).tolist(), "high": (middle + half).tolist()}
+    return constants
+
+
+def range_constants(episodes: TensorDictBase) -> dict[str, dict[str, list[float]]]:
+    """Compute the range of every quantity of a robot dataset, from its values alone.
+
+    A range holds all but one in a thousand of the values at either end. An entry that never changes gets a range of 1
+    about its value. An entry that holds only noise is scaled to [-1, 1] like any other, and should not be chosen.
+
+    Args:
+        episodes: ``[E, T]`` training episodes with ``action``, ``goal`` and, optional, ``dynamics``.
+
+    Returns:
+        ``low`` and ``high`` ``[D]`` of action, goal and every quantity of the dynamics, in the dataset's units.
+    """
+    constants = {}
+    for key in ("action", "goal", *(("dynamics", q) for q in episodes.get("dynamics", {}).keys())):
+        values = episodes[key].flatten(0, 1).double().numpy()  # [N, D]
+        low, high = np.quantile(values, [0.001, 0.999], axis=0)
+        still = high - low <= 1e-6 * np.maximum(1, np.abs(high))
+        low, high = np.where(still, low - 0.5, low), np.where(still, high + 0.5, high)
+        constants[key[-1] if isinstance(key, tuple) else key] = {"low": low.tolist(), "high": high.tolist()}
+    return constants

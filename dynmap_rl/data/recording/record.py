@@ -1,0 +1,170 @@
+"""Recording of expert rollouts as a LeRobot v3.0 dataset with dynamics columns.
+
+A recording is made of shards in ``<root>.parts``, which are merged into ``<root>`` at the end. A killed recording keeps
+its finished shards, and the same call resumes. The result depends neither on interruptions nor on the number of workers.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import shutil
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+
+from tqdm import tqdm
+
+from dynmap_rl.envs.tasks import get_task
+from dynmap_rl.experts.network import list_checkpoints
+from dynmap_rl.utils.files import read_json, write_json
+from dynmap_rl.utils.processes import start_worker
+
+from ..demonstrations import FORMAT, META, load_meta
+from .shards import Shard, merge_shards, record_shard
+
+KINDS = ("demonstrations", "exploration")
+SHARD_EPISODES = 25
+
+
+def record_dataset(
+    root: str | Path,
+    task: str = "balance_reaching",
+    kind: str = "demonstrations",
+    episodes: int = 300,
+    eval_episodes: int = 50,
+    workers: int = 2,
+    expert: str | Path | None = None,
+) -> Path:
+    """Record training and held-out episodes, or resume an interrupted recording.
+
+    Args:
+        root: folder of the dataset; a complete recording with the same settings is left as it is.
+        task: name of the task, or ``module:Class`` of your own.
+        kind: ``demonstrations`` (successful episodes only) or ``exploration`` (noise and detours, all episodes).
+        episodes: number of episodes of the split ``train``.
+        eval_episodes: number of episodes of the split ``eval``.
+        workers: number of processes; 1 records in this process. A script that uses more must have the guard
+            ``if __name__ == "__main__"``.
+        expert: folder of the expert's checkpoints; by default the expert that ships for the task.
+
+    Returns:
+        The folder of the dataset.
+
+    Raises:
+        ValueError: an argument is wrong, the folder holds something else or is being recorded to, or too few episodes
+            succeed.
+        OSError: the folder cannot be written, or a worker died. Finished shards are kept.
+    """
+    from filelock import FileLock, Timeout
+
+    root = Path(root).expanduser()
+    settings = {"task": task, "kind": kind, "episodes": episodes, "eval_episodes": eval_episodes}
+    settings |= {"expert": str(expert or task), "format": FORMAT}
+    _check_settings(root, settings)
+    parts = root.with_name(f"{root.name}.parts")
+    if (root / META).exists() and not parts.exists():
+        return root
+    try:
+        parts.mkdir(parents=True, exist_ok=True)
+        with FileLock(parts / ".lock", timeout=0):
+            if not (root / META).exists():
+                _record(root, parts, settings, workers)
+            shutil.rmtree(parts)
+    except Timeout as error:
+        raise ValueError(
+            f"{root} is being recorded by another process; wait for that process or stop it"
+        ) from error
+    except BrokenProcessPool as error:
+        raise OSError(
+            f"a worker died while recording {root}; repeat the call with fewer workers, finished episodes are kept"
+        ) from error
+    except OSError as error:
+        raise OSError(
+            f"cannot record {root} ({error}); is there space, and may the folder be written? The same call resumes"
+        ) from error
+    return root
+
+
+def _check_settings(root: Path, settings: dict) -> None:
+    get_task(settings["task"])
+    list_checkpoints(settings["expert"])
+    if settings["kind"] not in KINDS:
+        raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {settings['kind']!r}")
+    for name in ("episodes", "eval_episodes"):
+        if settings[name] < 1:
+            raise ValueError(f"{name} must be at least 1, got {settings[name]}")
+    stored = _stored_settings(root)
+    if stored not in (None, settings):
+        changed = ", ".join(
+            f"{name} {stored.get(name)} instead of {value}"
+            for name, value in settings.items()
+            if stored.get(name) != value
+        )
+        raise ValueError(f"{root} holds another recording ({changed}); choose another folder or delete it")
+
+
+def _stored_settings(root: Path) -> dict | None:
+    """Return the settings of the recording in a folder, complete or not; None where there is none."""
+    if (root / META).exists():
+        meta = load_meta(root)
+        sizes = {name: end - first for name, (first, end) in meta["splits"].items()}
+        stored = {name: meta.get(name) for name in ("task", "kind", "expert", "format")}
+        return stored | {"episodes": sizes["train"], "eval_episodes": sizes["eval"]}
+    if root.exists() and (not root.is_dir() or any(root.iterdir())):
+        raise ValueError(
+            f"{root} must be a recording or a new folder, got something else; choose another folder or delete it"
+        )
+    path = root.with_name(f"{root.name}.parts") / "settings.json"
+    return read_json(path) if path.exists() else None
+
+
+def _record(root: Path, parts: Path, settings: dict, workers: int) -> None:
+    write_json(parts / "settings.json", settings)
+    for leftover in parts.glob("*.tmp"):
+        shutil.rmtree(leftover)
+    shards = _plan_shards(parts, settings)
+    todo = [shard for shard in shards if not shard.folder.exists()]
+    total, left = (sum(shard.count for shard in s) for s in (shards, todo))
+    with tqdm(total=total, initial=total - left, unit="episode", desc=f"recording {root.name}") as progress:
+        for shard in _run_shards(todo, workers):
+            progress.update(shard.count)
+    merged = parts / "merged.tmp"
+    merge_shards(shards, merged, settings)
+    merged.replace(root)
+
+
+def _plan_shards(parts: Path, settings: dict) -> list[Shard]:
+    return [
+        Shard(
+            folder=parts / f"{split}_{number:04d}",
+            task=settings["task"],
+            expert=settings["expert"],
+            kind=settings["kind"],
+            split=split,
+            number=number,
+            count=min(SHARD_EPISODES, total - number * SHARD_EPISODES),
+        )
+        for split, total in (("train", settings["episodes"]), ("eval", settings["eval_episodes"]))
+        for number in range(-(-total // SHARD_EPISODES))
+    ]
+
+
+def _run_shards(shards: list[Shard], workers: int) -> Iterator[Shard]:
+    """Record shards and yield each when it is complete."""
+    workers = min(workers, len(shards))
+    if workers <= 1:
+        for shard in shards:
+            record_shard(shard)
+            yield shard
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=start_worker) as pool:
+        futures = {pool.submit(record_shard, shard): shard for shard in shards}
+        try:
+            for future in as_completed(futures):
+                future.result()
+                yield futures[future]
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise

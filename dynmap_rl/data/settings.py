@@ -1,0 +1,29 @@
+"""Typed settings of the data. A comment above a field is the help text of its option."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from dynmap_rl.utils.settings import check_at_least
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """Random changes of training windows (see :func:`dynmap_rl.data.augment`)."""
+
+    # Permute the colour channels of each window.
+    recolor: bool = True
+    # Mirror half of the windows left to right.
+    mirror: bool = True
+    # Largest shift of a window, in pixels.
+    max_shift: int = 6
+    # Largest number of bars painted on the background of a window.
+    distractors: int = 3
+
+    def __post_init__(self):
+        check_at_least(self, 0, "max_shift", "distractors")
+
+    @classmethod
+    def off(cls) -> Augmentation:
+        """Return the settings without any change."""
+        return cls(recolor=False, mirror=False, max_shift=0, distractors=0)

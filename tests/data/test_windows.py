@@ -1,0 +1,20 @@
+"""Windows are pieces of episodes."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from dynmap_rl.data.windows import sample_windows
+
+
+def test_windows_are_pieces_of_episodes():
+    steps = torch.arange(20).expand(5, 20)
+    episodes = TensorDict({"t": steps, "e": torch.arange(5)[:, None].expand(5, 20)}, [5, 20])
+    windows = sample_windows(episodes, 32, 7, torch.Generator().manual_seed(0))
+    assert windows.shape == (32, 7)
+    assert (windows["t"].diff(dim=1) == 1).all()
+    assert (windows["e"] == windows["e"][:, :1]).all()
+    assert (windows["t"][::2, 0] == 0).all()
+    assert len(windows["t"][1::2, 0].unique()) > 4
+    with pytest.raises(ValueError, match="21"):
+        sample_windows(episodes, 2, 21, torch.Generator())
