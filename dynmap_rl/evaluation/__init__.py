@@ -1,25 +1,5 @@
-"""Closed-loop rollouts, DR / PE / SR with intervals, errors on held-out episodes, probes."""
+"""Evaluation in closed loop with drop rate, position error and success rate; held-out errors; probes of world models."""
 
-from .errors import policy_errors, prediction_errors
-from .open_loop import open_loop_errors
-from .probing import probe
-from .protocol import SHARED_STARTS, evaluate
-from .rollout import episode_rows, roll_out, scene_seeds
-from .statistics import rate_gap, shared_interval, summarize, summarize_seeds, wilson
+import lazy_loader
 
-__all__ = [
-    "SHARED_STARTS",
-    "episode_rows",
-    "evaluate",
-    "open_loop_errors",
-    "policy_errors",
-    "prediction_errors",
-    "probe",
-    "rate_gap",
-    "roll_out",
-    "scene_seeds",
-    "shared_interval",
-    "summarize",
-    "summarize_seeds",
-    "wilson",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,6 +1,8 @@
-"""Training loops that the recipes share: the world model alone, and a policy on a frozen world model's states."""
+"""Errors of world models and policies on held-out episodes."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import torch
 from tensordict import TensorDictBase
@@ -10,16 +12,27 @@ from dynmap_rl.data.features import compute_features
 from dynmap_rl.modules.world_model import WorldModel
 from dynmap_rl.objectives.imitation import ImitationLoss, imitation_loss
 
-GROUPS = {"": [0, 1, 3, 4], "_angle": [2, 5]}  # entries of our tasks' dynamics that have one unit
+GROUPS = {"": [0, 1, 3, 4], "_angle": [2, 5]}  # entries of the tasks' dynamics that share a unit
+STATES = ("latent", "hidden1", "hidden2", "goal")
 
 
 @torch.no_grad()
 def prediction_errors(
     world_model: WorldModel, episodes: TensorDictBase, batch: int = 10, by_entry: bool = False
 ) -> dict[str, float]:
-    """One-step prediction errors on episodes ``[E, T]``: the frames' root mean square (0..1), and the mean absolute
-    error of each decoded quantity's x and y (m, m/s, m/s^2) and of its angles (``_angle``: rad, rad/s, rad/s^2), or,
-    ``by_entry``, of each of its entries (``_0``, ``_1``, ...)."""
+    """Measure one-step prediction errors.
+
+    Args:
+        world_model: what predicts.
+        episodes: TensorDict ``[E, T]`` with ``pixels``, ``action`` and ``dynamics``.
+        batch: episodes at a time.
+        by_entry: give the error of every entry of the dynamics instead of the means.
+
+    Returns:
+        ``error_rgb``, the root mean square error of the frames (0 to 1), and for every supervised quantity the mean
+        absolute error of x and y, ``error_position`` (m, m/s, m/s^2), and of the angles, ``error_position_angle`` (rad,
+        rad/s, rad/s^2); with ``by_entry`` those of the single entries, ``error_position_0`` and so on.
+    """
     sums: dict[str, float] = {}
     device = next(world_model.parameters()).device
     for chunk in episodes.split(batch):
@@ -40,20 +53,46 @@ def prediction_errors(
 
 @torch.no_grad()
 def policy_error(world_model: WorldModel, policy: nn.Module, episodes: TensorDictBase) -> float:
-    """The plain L1 loss of a policy on episodes ``[E, T]``."""
+    """Return the plain L1 loss of a policy on episodes ``[E, T]`` (normalised units)."""
     return ImitationLoss(policy)(compute_features(world_model, episodes))["loss_policy"].item()
 
 
-STATES = ("latent", "hidden1", "hidden2", "goal")
-
-
 @torch.no_grad()
-def policy_errors(policy, features: TensorDictBase) -> dict[str, float]:
-    """A policy on held-out states (see :func:`dynmap_rl.data.compute_features`): ``imitation_l1``, the paper's loss in
-    normalised units, and the mean absolute error of every entry of the action, ``error_action_0`` and so on, in the
-    dataset's."""
+def policy_errors(policy: nn.Module, features: TensorDictBase) -> dict[str, float]:
+    """Measure the errors of a policy's actions.
+
+    Args:
+        policy: what is judged.
+        features: held-out states and actions (see :func:`dynmap_rl.data.compute_features`).
+
+    Returns:
+        ``imitation_l1``, the paper's loss in normalised units, and the mean absolute error of every entry of the action
+        in the dataset's units, ``error_action_0`` and so on.
+    """
     features = features.to(next(policy.parameters()).device)
     predicted = policy(*(features[key] for key in STATES))
     loss = imitation_loss(predicted, features["action"], policy.action, features["disturbed"])
     entries = (predicted - features["action"]).abs().mean((0, 1)).tolist()
     return {"imitation_l1": loss.item()} | {f"error_action_{i}": e for i, e in enumerate(entries)}
+
+
+def judge_held_out(
+    world_model: WorldModel,
+    policy: nn.Module,
+    load: Callable[[], tuple[dict[str, TensorDictBase], dict]],
+) -> dict[str, dict[str, float]]:
+    """Measure world model and policy on the held-out episodes of a robot dataset.
+
+    Args:
+        world_model: what predicts.
+        policy: what acts on the world model's states.
+        load: function that returns the episodes (``train`` and ``eval``) and the constants of normalisation, such as a
+            ``functools.partial`` of :func:`dynmap_rl.data.load_robot_dataset`.
+
+    Returns:
+        ``held_out``: :func:`prediction_errors` of every entry, and :func:`policy_errors`.
+    """
+    episodes, _ = load()
+    errors = prediction_errors(world_model, episodes["eval"], by_entry=True)
+    features = compute_features(world_model, episodes["eval"])
+    return {"held_out": errors | policy_errors(policy, features)}

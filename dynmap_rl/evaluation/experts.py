@@ -1,17 +1,23 @@
-"""PPO, from states for the experts (paper, Sec. IV-C) and from whatever else an environment's ``state`` holds."""
+"""Rates of the state-based experts, and the scenes on which their checkpoints are judged."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
 from dynmap_rl.envs.scene import scene_seed
-from dynmap_rl.envs.tasks import BalanceReaching
+from dynmap_rl.envs.task import Task
 from dynmap_rl.envs.world import World
+
 from .statistics import wilson
 
 
-def rates(task: BalanceReaching, worlds: Iterable[World]) -> dict[str, float]:
-    """``success``, ``drop``, ``position_error`` (m) and number of ``episodes`` of worlds at their ends."""
+def rates(task: Task, worlds: Iterable[World]) -> dict[str, float]:
+    """Return the rates of ``success`` and ``drop``, the mean ``position_error`` (m) and the number of ``episodes``.
+
+    Args:
+        task: defines success.
+        worlds: worlds at the end of their episodes.
+    """
     worlds = list(worlds)
     return {
         "success": sum(task.is_success(world) for world in worlds) / len(worlds),
@@ -22,7 +28,7 @@ def rates(task: BalanceReaching, worlds: Iterable[World]) -> dict[str, float]:
 
 
 def rates_text(row: dict) -> str:
-    """What :func:`rates` gave as text, with the 95 % Wilson interval of the success rate."""
+    """Return the numbers of :func:`rates` as text, with the 95 % Wilson interval of the success rate."""
     low, high = wilson(row["success"] * row["episodes"], row["episodes"])
     error = f"position error {1000 * row['position_error']:.0f} mm"
     rate = f"success {100 * row['success']:.1f} % [{low:.1f}, {high:.1f}]   drop {100 * row['drop']:.1f} %"
@@ -30,6 +36,5 @@ def rates_text(row: dict) -> str:
 
 
 def fresh_scenes(count: int) -> list[int]:
-    """Seeds of the scenes that checkpoints are judged on, the last by more of them: of the exploration split, never trained
-    on, and none of the tables' test scenes."""
+    """Return the seeds of ``count`` scenes that are neither trained on nor test scenes of the tables."""
     return [scene_seed("exploration", 10_000_000 + i) for i in range(count)]

@@ -1,4 +1,4 @@
-"""How far a world model's predictions carry without frames: its open-loop error over the horizon."""
+"""Open-loop errors of a world model: predictions over many steps without frames."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ from dynmap_rl.modules.world_model import WorldModel
 def open_loop_errors(
     world_model: WorldModel, episodes: TensorDictBase, context: int = 10, horizon: int = 40, batch: int = 50
 ) -> dict:
-    """Predicted against simulated poses, with the demonstrations' actions and none of their later frames.
+    """Measure the errors of poses that are predicted from actions alone, after some frames.
 
     Args:
-        world_model: decodes positions.
+        world_model: world model that decodes positions.
         episodes: held-out demonstrations ``[E, T]`` with ``pixels``, ``action`` and ``dynamics``.
-        context: frames that are seen first, at least 1.
-        horizon: steps that are predicted after the last of them.
+        context: frames that are encoded first, at least 1.
+        horizon: steps that are predicted after the last of these frames.
         batch: episodes at a time.
 
     Returns:
-        ``model``, and ``still``, which is as if all stayed where it is in the last frame seen: for each
-        ``cart_mm``, ``block_mm`` (mean distance, mm) and ``cart_deg``, ``block_deg`` (mean absolute difference of
-        angles, degrees), lists of ``horizon`` numbers, 1 step ahead first. Beside them ``context`` and ``episodes``.
+        ``model``, and ``still`` for the constant prediction of the last pose. Each has ``cart_mm``, ``block_mm`` (mean
+        distance, mm) and ``cart_deg``, ``block_deg`` (mean absolute difference of angles, degrees): lists of ``horizon``
+        numbers, one step ahead first. ``context`` and ``episodes`` repeat the sizes.
 
     Raises:
-        ValueError: no positions are decoded, or the episodes are too short.
+        ValueError: the world model decodes no positions, or the episodes are too short.
     """
     if "position" not in world_model.supervision:
-        raise ValueError("the world model is not supervised on position: there is nothing to compare")
+        raise ValueError("the world model must be supervised on position for open-loop errors")
     if horizon < 1:
-        raise ValueError(f"a horizon is at least one step, not {horizon}")
+        raise ValueError(f"horizon must be at least 1, got {horizon}")
     if context < 1 or context + horizon > episodes.shape[1]:
         steps = episodes.shape[1]
-        raise ValueError(f"{context} + {horizon} steps do not fit into episodes of {steps}")
+        raise ValueError(f"context + horizon must be at most {steps}, got {context} + {horizon}")
     device = next(world_model.parameters()).device
     totals = {"model": 0.0, "still": 0.0}
     for chunk in episodes.split(batch):
@@ -60,7 +60,7 @@ def open_loop_errors(
 
 
 def _pose_errors(difference: torch.Tensor) -> torch.Tensor:
-    """``[E, K, 6]`` (m, rad) to ``[K, 4]``, summed over episodes (mm, degrees; cart, then block)."""
+    """Convert ``[E, K, 6]`` (m, rad) to sums over episodes ``[K, 4]`` (mm, degrees; cart, then block)."""
     parts = difference.unflatten(-1, (2, 3))  # (E, K, 2, 3)
     distance, angle = parts[..., :2].norm(dim=-1) * 1000, parts[..., 2].abs() * 180 / math.pi
     return torch.stack([distance, angle], -1).flatten(2).sum(0)

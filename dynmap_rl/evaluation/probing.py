@@ -1,4 +1,4 @@
-"""Which states of a world model tell which dynamics, by linear maps of them, and pictures of that and of its errors."""
+"""Linear probes: how much of the dynamics a linear map reads from each state of a world model."""
 
 from __future__ import annotations
 
@@ -14,16 +14,18 @@ STATES = "latent", "hidden1", "hidden2"
 
 @torch.no_grad()
 def probe(world_model: WorldModel, train: TensorDictBase, test: TensorDictBase) -> dict[str, dict]:
-    """How much of the dynamics a linear map of a state tells, where the map is fitted to demonstrations and judged on
-    others.
+    """Fit linear maps from every state to the dynamics, and measure R^2 on other episodes.
+
+    The latent at t is a function of the frame at t, the hidden states at t of everything before.
 
     Args:
-        world_model: frozen. Its latent at t sees the frame at t, its hidden states at t everything before.
-        train, test: episodes ``[E, T]`` with ``pixels``, ``action``, ``goal`` and ``dynamics``.
+        world_model: world model with frozen weights.
+        train: episodes ``[E, T]`` with ``pixels``, ``action``, ``goal`` and ``dynamics``, to fit the maps to.
+        test: likewise, to measure R^2 on.
 
     Returns:
-        For each of ``latent``, ``hidden1``, ``hidden2`` and each quantity R^2 on ``test`` for cart x, y, theta, block x,
-        y, theta, a list: 1 is all of it, 0 what the mean tells. Steps t = 0, where memory is empty, are left out.
+        For each of ``latent``, ``hidden1``, ``hidden2`` and each quantity a list of R^2 for cart x, y, theta, block x, y,
+        theta: 1 is a perfect map, 0 as good as the mean. Steps t = 0, at which memory is empty, are left out.
     """
     inputs = [_states(world_model, episodes) for episodes in (train, test)]
     targets = [
@@ -43,9 +45,9 @@ def _states(world_model: WorldModel, episodes: TensorDictBase) -> dict[str, torc
 
 
 def _explained(x: torch.Tensor, x_test: torch.Tensor, y: torch.Tensor, y_test: torch.Tensor) -> torch.Tensor:
-    """R^2 ``[D]`` of a linear map of ``x`` ``[N, F]`` fitted to ``y`` ``[N, D]`` by least squares."""
+    """Fit a linear map from ``x`` ``[N, F]`` to ``y`` ``[N, D]`` by least squares; return R^2 ``[D]`` on the test data."""
     mean, center = x.mean(0), y.mean(0)
-    # This driver also takes states that are constant.
+    # This driver accepts constant states too.
     weights = torch.linalg.lstsq(x - mean, y - center, driver="gelsd").solution
     rest = y_test - center - (x_test - mean) @ weights
     return 1 - rest.square().sum(0) / (y_test - y_test.mean(0)).square().sum(0)

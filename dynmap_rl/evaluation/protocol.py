@@ -1,58 +1,75 @@
-"""What a run leaves behind: ``eval.json``, the table row beside the paper's, figures, an animation, ``report.html``."""
+"""The two protocols of evaluation in closed loop, and their rows in ``eval.json`` (paper, Sec. V-B)."""
 
 from __future__ import annotations
 
 from tensordict.nn import TensorDictModuleBase
+from torch import nn
+
+from dynmap_rl.modules.actor import Actor
+from dynmap_rl.modules.world_model import WorldModel
 
 from .rollout import episode_rows, roll_out, scene_seeds
+from .settings import SHARED_STARTS, Evaluation
 from .statistics import summarize
-
-SHARED_STARTS = 1000  # the paper's protocol uses the scenes after these
-
-
-def evaluate(
-    actor: TensorDictModuleBase,
-    task: str,
-    test_episodes: int = 1000,
-    paper_episodes: int = 50,
-    split: str = "test",
-) -> dict[str, dict]:
-    """One actor (see :func:`roll_out`) by both protocols: rows and summary on ``test_episodes`` shared start states
-    (``test``) and on ``paper_episodes`` others (``paper``, where there are any) of a split of the scenes. All episodes
-    run as one batch.
-
-    Raises:
-        ValueError: more than 1,000 shared start states, which are all there are.
-    """
-    if test_episodes > SHARED_STARTS:
-        raise ValueError(f"there are {SHARED_STARTS} shared start states, not {test_episodes}")
-    seeds = scene_seeds(split, test_episodes)
-    seeds += scene_seeds(split, paper_episodes, start=SHARED_STARTS)
-    rows = episode_rows(roll_out(actor, task, seeds), seeds)
-    parts = {"test": rows[:test_episodes], "paper": rows[test_episodes:]}
-    return {
-        name: {"summary": summarize(part), "rows": _columns(part)} for name, part in parts.items() if part
-    }
-
-
-def result_rows(result: dict) -> list[list[dict]]:
-    """The rows on the shared start states of every policy seed of an ``eval.json``."""
-    return [_rows(seed["test"]["rows"]) for seed in result["results"]]
-
 
 FLAGS = "success", "dropped", "touched"
 
 
-def _columns(rows: list[dict]) -> dict:
-    """Rows of scenes in a row, as short as they can be told: flags as text of 0 and 1, and the first scene's seed."""
+def evaluate(
+    actor: TensorDictModuleBase, task: str, settings: Evaluation | None = None
+) -> dict[str, dict[str, dict]]:
+    """Evaluate an actor in closed loop; all episodes run as one batch.
+
+    Args:
+        actor: see :func:`dynmap_rl.evaluation.roll_out`.
+        task: name of the task.
+        settings: scenes to evaluate on; default :class:`Evaluation`.
+
+    Returns:
+        ``test`` on the shared start states and, if ``settings.paper_episodes`` is not 0, ``paper`` on others. Each has
+        ``summary`` (see :func:`dynmap_rl.evaluation.summarize`) and ``rows`` (see :func:`pack_rows`).
+    """
+    settings = settings or Evaluation()
+    seeds = scene_seeds(settings.split, settings.episodes)
+    seeds += scene_seeds(settings.split, settings.paper_episodes, start=SHARED_STARTS)
+    rows = episode_rows(roll_out(actor, task, seeds), seeds)
+    parts = {"test": rows[: settings.episodes], "paper": rows[settings.episodes :]}
+    return {
+        name: {"summary": summarize(part), "rows": pack_rows(part)} for name, part in parts.items() if part
+    }
+
+
+def judge_in_closed_loop(
+    world_model: WorldModel, policy: nn.Module, task: str, settings: Evaluation | None = None
+) -> dict[str, dict[str, dict]]:
+    """Evaluate a world model and its policy as one actor (see :func:`evaluate`)."""
+    return evaluate(Actor(world_model, policy, mixed=True), task, settings)
+
+
+def pack_rows(rows: list[dict]) -> dict:
+    """Return episode rows of consecutive scenes as columns.
+
+    Args:
+        rows: see :func:`dynmap_rl.evaluation.episode_rows`.
+
+    Returns:
+        ``first_scene_seed``, a text of 0 and 1 for each of ``success``, ``dropped`` and ``touched``, and the list
+        ``position_error`` (m).
+    """
     columns = {flag: "".join(str(int(row[flag])) for row in rows) for flag in FLAGS}
     errors = [round(row["position_error"], 4) for row in rows]
     return {"first_scene_seed": rows[0]["scene_seed"], **columns, "position_error": errors}
 
 
-def _rows(columns: dict) -> list[dict]:
+def unpack_rows(columns: dict) -> list[dict]:
+    """Return the episode rows that :func:`pack_rows` packed."""
     flags = [[flag == "1" for flag in columns[name]] for name in FLAGS]
     values = zip(*flags, columns["position_error"], strict=True)
     names = "scene_seed", *FLAGS, "position_error"
     first = columns["first_scene_seed"]
     return [dict(zip(names, (first + i, *row), strict=True)) for i, row in enumerate(values)]
+
+
+def result_rows(result: dict) -> list[list[dict]]:
+    """Return, for every policy seed of an ``eval.json``, the episode rows on the shared start states."""
+    return [unpack_rows(seed["test"]["rows"]) for seed in result["results"]]

@@ -7,8 +7,16 @@ from scipy.stats import binom, bootstrap, norm
 
 
 def summarize(rows: list[dict]) -> dict[str, float]:
-    """DR and SR in %, PE in mm (paper, Sec. V-B), over any number of episode rows, with 95 % Wilson intervals as of
-    independent episodes; and the share of episodes in which a wall was touched, in % (``touched``)."""
+    """Summarise episode rows (paper, Sec. V-B).
+
+    Args:
+        rows: see :func:`dynmap_rl.evaluation.episode_rows`.
+
+    Returns:
+        ``DR`` and ``SR`` (%) with 95 % Wilson intervals for independent episodes, ``PE`` (mm), the number of
+        ``episodes`` and, where the rows have them, the share of episodes in which a wall was touched (``touched``, %)
+        and the errors of the predicted cart position (``localization``, ``localization_away``, mm).
+    """
     count = len(rows)
     dropped = sum(row["dropped"] for row in rows)
     success = sum(row["success"] for row in rows)
@@ -29,7 +37,7 @@ def summarize(rows: list[dict]) -> dict[str, float]:
 
 
 def summarize_seeds(rows_by_seed: list[list[dict]]) -> dict[str, tuple[float, float]]:
-    """The paper's protocol: mean and standard deviation over policy seeds of DR (%), PE (mm) and SR (%)."""
+    """Return mean and standard deviation over policy seeds of DR (%), PE (mm) and SR (%): the paper's protocol."""
     summaries = [summarize(rows) for rows in rows_by_seed]
     return {
         key: (float(np.mean([s[key] for s in summaries])), float(np.std([s[key] for s in summaries])))
@@ -38,7 +46,7 @@ def summarize_seeds(rows_by_seed: list[list[dict]]) -> dict[str, tuple[float, fl
 
 
 def wilson(successes: float, count: float) -> tuple[float, float]:
-    """95 % Wilson interval of a rate, in %; SciPy's is for whole numbers alone."""
+    """Return the 95 % Wilson interval of a rate, in %; SciPy has it for whole numbers only."""
     rate, z = successes / count, float(norm.ppf(0.975))
     middle = rate + z**2 / (2 * count)
     half = z * (rate * (1 - rate) / count + z**2 / (4 * count**2)) ** 0.5
@@ -47,11 +55,15 @@ def wilson(successes: float, count: float) -> tuple[float, float]:
 
 
 def shared_interval(rows_by_seed: list[list[dict]], outcome: str = "success") -> tuple[float, float]:
-    """95 % interval of a rate over policy seeds that met the same start states, in %.
+    """Return the 95 % interval of a rate over policy seeds that share their start states, in %.
 
-    Their episodes are not independent: a start state that is hard for one is hard for the others. Wilson's interval is
-    taken for as many independent episodes as would vary as much as the means over the seeds do from start state to
-    start state (Kish's effective sample size): at least one a start state, at most all.
+    These episodes are not independent: a start state that is hard for one policy is hard for the others. The result is
+    Wilson's interval for the effective number of independent episodes (Kish), which follows from the variance of the
+    means over the seeds. It is at least the number of start states, and at most the number of episodes.
+
+    Args:
+        rows_by_seed: rows of the same scenes in the same order for every policy seed.
+        outcome: entry of the rows that is counted.
     """
     values = np.array([[row[outcome] for row in rows] for rows in rows_by_seed], float)  # [seeds, starts]
     rate, starts = values.mean(), values.shape[1]
@@ -61,22 +73,26 @@ def shared_interval(rows_by_seed: list[list[dict]], outcome: str = "success") ->
 
 
 def rate_gap(rows_a: list[list[dict]], rows_b: list[list[dict]], outcome: str = "success") -> dict:
-    """A rate of a less that of b, in points, on start states that both share.
+    """Compare the rates of two results on the same start states.
 
     Args:
-        rows_a, rows_b: per policy seed, the rows of the same scenes in the same order.
-        outcome: what is counted.
+        rows_a: rows of the same scenes in the same order for every policy seed.
+        rows_b: likewise; its rate is subtracted.
+        outcome: entry of the rows that is counted.
 
     Returns:
-        ``gap``, its 95 % bootstrap ``interval`` over the start states, after averaging over policy seeds, and ``p``, the
-        two-sided probability of such a gap if the two were exchanged at random in every start state.
+        ``gap`` in percentage points, its 95 % bootstrap ``interval`` over the start states, after averaging over policy
+        seeds, and ``p``, the two-sided probability of a gap of this size if the two were exchanged at random in every
+        start state.
 
     Raises:
         ValueError: the two were not evaluated on the same scenes.
     """
     scenes = [[row["scene_seed"] for row in rows] for rows in (*rows_a, *rows_b)]
     if any(s != scenes[0] for s in scenes):
-        raise ValueError("the two results are not on the same start states; evaluate both again")
+        raise ValueError(
+            "both results must be on the same start states, got different scenes; evaluate both again"
+        )
 
     def count(rows, weight):  # whole numbers, so that a tie is one
         return weight * np.sum([[row[outcome] for row in seed] for seed in rows], axis=0)
@@ -84,16 +100,20 @@ def rate_gap(rows_a: list[list[dict]], rows_b: list[list[dict]], outcome: str = 
     counts = count(rows_a, len(rows_b)) - count(rows_b, len(rows_a))
     difference = 100 * counts / (len(rows_a) * len(rows_b))
     gap = float(difference.mean())
-    interval = gap, gap  # where there is nothing to choose from
+    interval = gap, gap  # of equal differences
     if np.ptp(difference):
-        found = bootstrap((difference,), np.mean, rng=np.random.default_rng(0)).confidence_interval
+        found = bootstrap(
+            (difference,), np.mean, batch=1000, rng=np.random.default_rng(0)
+        ).confidence_interval
         interval = float(found.low), float(found.high)
     return {"gap": gap, "interval": interval, "p": exchange_p(counts)}
 
 
 def exchange_p(differences: np.ndarray) -> float:
-    """The two-sided p of whole numbers' sum, if every sign were drawn at random: exact, where SciPy's permutation test
-    draws a sample, and in a thousandth of its time."""
+    """Return the two-sided p of the sum of whole numbers if every sign were drawn at random.
+
+    The result is exact. SciPy's permutation test draws a sample and takes a thousand times as long.
+    """
     sizes, counts = np.unique(np.abs(differences[differences != 0]), return_counts=True)
     unit = max(np.gcd.reduce(sizes, initial=0), 1)
     chances = np.ones(1)  # of the sums, in steps of the unit

@@ -1,1 +1,5 @@
-"""Tables, findings and figures of the paper; nothing else imports this package but recipes and tests."""
+"""The paper's tables, findings and figures; only recipes and tests import this package."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

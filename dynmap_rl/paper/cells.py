@@ -1,4 +1,4 @@
-"""The cells of the paper's Tables I, II and III: which recipe makes each, with which options, from which world model."""
+"""Cells of the paper's Tables I, II and III: the recipe, its options, and the world model of each."""
 
 from __future__ import annotations
 
@@ -10,7 +10,13 @@ SUPERVISIONS = (
     "none", "position", "velocity", "acceleration", "position,velocity", "position,acceleration",
     "velocity,acceleration", "position,velocity,acceleration",
 )  # fmt: skip
-CLAIMS = "none", "position", "velocity", "position,velocity", "position,velocity,acceleration"
+SEEDED = (
+    "none",
+    "position",
+    "velocity",
+    "position,velocity",
+    "position,velocity,acceleration",
+)  # these carry the claims
 MINUTES = {
     "decoupled": 14,
     "reuse": 5,
@@ -22,59 +28,69 @@ MINUTES = {
 
 @dataclass(frozen=True)
 class Cell:
-    """A run of a recipe; ``needs`` names the cell whose world model it takes."""
+    """A run of a recipe.
+
+    Attributes:
+        name: name of the cell, its run and its result.
+        recipe: name of the recipe.
+        arguments: options of the recipe.
+        needs: name of the cell whose world model is used, or None.
+    """
 
     name: str
     recipe: str
-    arguments: tuple[str, ...]
+    arguments: tuple[str, ...] = ()
     needs: str | None = None
 
     @property
     def task(self) -> str:
-        """That the cell's policies are judged on."""
+        """Task of the cell's policies."""
         return self.arguments[self.arguments.index("--task") + 1] if "--task" in self.arguments else TASKS[0]
 
     @property
     def table(self) -> str:
-        """Of the paper, that the cell belongs to: ``I``, ``II`` or ``III``; each has a task of its own."""
+        """Table of the cell: ``I``, ``II`` or ``III``, one for each task."""
         return TABLES[TASKS.index(self.task)]
 
     @property
     def minutes(self) -> int:
-        """About how long it takes on one core."""
+        """Approximate minutes of one core."""
         return MINUTES["reuse" if self.recipe == "decoupled" and self.needs else self.recipe]
 
 
 def list_cells() -> list[Cell]:
-    """Those that train world models first."""
-    task, first, second = TASKS[0], [], []
-    for supervision in SUPERVISIONS:
-        row, given = supervision.replace(",", "_"), ("--supervision", supervision)
-        trained = f"{task}_decoupled_{row}_recurrent"
-        first.append(Cell(trained, "decoupled", given))
-        second.append(
-            Cell(
-                f"{task}_decoupled_{row}_feedforward",
-                "decoupled",
-                (*given, "--policy", "feedforward"),
-                trained,
-            )
-        )
-        first.append(Cell(f"{task}_joint_{row}_recurrent", "joint", given))
+    """Return all cells; those that train world models come first."""
+    task = TASKS[0]
+    first = [_train(supervision) for supervision in SUPERVISIONS]
     first += [
-        Cell(
-            f"{task}_decoupled_{s.replace(',', '_')}_recurrent_world_model_{seed}",
-            "decoupled",
-            ("--supervision", s, "--world_model_seed", str(seed)),
-        )
-        for s in CLAIMS
-        for seed in (1, 2)
+        Cell(f"{task}_joint_{_name(s)}_recurrent", "joint", ("--world_model.supervision", s))
+        for s in SUPERVISIONS
     ]
-    first.append(Cell(f"{task}_end_to_end_recurrent", "end_to_end", ()))
-    sources = [cell for cell in first if "world_model_" not in cell.name]
-    for other in TASKS[1:]:
-        second += [
-            Cell(cell.name.replace(task, other, 1), "generalize", ("--task", other), cell.name)
-            for cell in sources
-        ]
-    return first + second
+    first.append(Cell(f"{task}_end_to_end_recurrent", "end_to_end"))
+    reuse = [_reuse(supervision) for supervision in SUPERVISIONS]
+    reuse += [
+        Cell(cell.name.replace(task, other, 1), "generalize", ("--task", other), needs=cell.name)
+        for other in TASKS[1:]
+        for cell in first
+    ]
+    return first + [_train(s, seed) for s in SEEDED for seed in (1, 2)] + reuse
+
+
+def _name(supervision: str) -> str:
+    return supervision.replace(",", "_")
+
+
+def _train(supervision: str, seed: int = 0) -> Cell:
+    """Return the cell that trains a decoupled world model and recurrent policies."""
+    name = f"{TASKS[0]}_decoupled_{_name(supervision)}_recurrent"
+    arguments = ("--world_model.supervision", supervision)
+    if not seed:
+        return Cell(name, "decoupled", arguments)
+    return Cell(f"{name}_world_model_{seed}", "decoupled", (*arguments, "--world_model.seed", str(seed)))
+
+
+def _reuse(supervision: str) -> Cell:
+    """Return the cell that trains feed-forward policies on the world model of a recurrent cell."""
+    arguments = ("--world_model.supervision", supervision, "--policy.kind", "feedforward")
+    name = f"{TASKS[0]}_decoupled_{_name(supervision)}_feedforward"
+    return Cell(name, "decoupled", arguments, needs=_train(supervision).name)

@@ -1,6 +1,6 @@
-"""The paper's figures of demonstrations (Fig. 2 to 4), of policy losses (Fig. 7) and of closed-loop episodes (Fig. 8).
+"""Figures of demonstrations (paper, Fig. 2 to 4), policy losses (Fig. 7) and closed-loop episodes (Fig. 8).
 
-Those of a world model (Fig. 6 and 9) are in ``figures.py``.
+Fig. 6 and 9 show a world model: see :func:`dynmap_rl.reporting.plot_prediction`.
 """
 
 from __future__ import annotations
@@ -20,12 +20,18 @@ from dynmap_rl.modules.supervision import row_name
 from dynmap_rl.reporting.figures import COMPONENTS, UNITS, moving_steps, plt, save_figure
 from dynmap_rl.runs.folder import read_metrics
 
-FRAMES = 8  # of a film strip
+FRAMES = 8  # in a film strip
 
 
 def widest_ways(episodes: TensorDictBase, count: int) -> TensorDictBase:
-    """``count`` of the episodes ``[E, T]``: where nothing was pushed, and among those where the cart's way from start
-    to end spans most of x and of y."""
+    """Return the ``count`` episodes in which the cart's path spans most of x and y.
+
+    Episodes with pushes come last.
+
+    Args:
+        episodes: demonstrations ``[E, T]``.
+        count: number of episodes.
+    """
     position = episodes["dynamics", "position"][..., :2]
     area = (position.amax(1) - position.amin(1)).prod(-1)
     pushed = episodes["disturbed"].flatten(1).any(1)
@@ -33,10 +39,12 @@ def widest_ways(episodes: TensorDictBase, count: int) -> TensorDictBase:
 
 
 def plot_trajectory(episode: TensorDictBase, constants: dict, path: Path) -> None:
-    """A demonstration ``[T]`` over time (paper, Fig. 2): frames, the cart's action and the block's dynamics.
+    """Draw a demonstration over time (paper, Fig. 2): frames, the cart's action and the block's dynamics.
 
     Args:
+        episode: demonstration ``[T]``.
         constants: of the dataset's normalisation; each panel's title gives the range that becomes [-1, 1].
+        path: file to write.
     """
     figure = plt.figure(figsize=(10, 8.5), layout="constrained")
     upper, lower = figure.subfigures(2, 1, height_ratios=[1, 5])
@@ -64,8 +72,12 @@ def plot_trajectory(episode: TensorDictBase, constants: dict, path: Path) -> Non
 
 
 def plot_film_strips(episodes: dict[str, TensorDictBase], path: Path) -> None:
-    """A demonstration ``[T]`` of each task as a strip of frames, from the start to where the block rests (paper,
-    Fig. 3)."""
+    """Draw demonstrations as strips of frames (paper, Fig. 3), from the start until the block rests.
+
+    Args:
+        episodes: a demonstration ``[T]`` of each task, by title.
+        path: file to write.
+    """
     figure = plt.figure(figsize=(1.3 * FRAMES, 1.8 * len(episodes)), layout="constrained")
     rows = figure.subfigures(len(episodes), 1, squeeze=False).flat
     for row, (title, episode) in zip(rows, episodes.items(), strict=True):
@@ -82,7 +94,14 @@ def _draw_strip(axes, episode: TensorDictBase) -> None:
 
 
 def plot_scenes(frames: torch.Tensor, path: Path, columns: int = 8, rows: int = 4) -> None:
-    """First frames uint8 ``[N, 3, 64, 64]`` of as many scenes as there are, in a grid (paper, Fig. 4)."""
+    """Draw first frames in a grid (paper, Fig. 4).
+
+    Args:
+        frames: uint8 ``[N, 3, 64, 64]``; at most ``rows * columns`` are drawn.
+        path: file to write.
+        columns: frames in a row.
+        rows: largest number of rows.
+    """
     frames = frames[: rows * columns].permute(0, 2, 3, 1).numpy()
     rows = -(-len(frames) // columns)
     figure, axes = plt.subplots(
@@ -99,15 +118,15 @@ def plot_scenes(frames: torch.Tensor, path: Path, columns: int = 8, rows: int = 
 
 
 def read_losses(folders: list[Path], held_out: bool = True) -> tuple[np.ndarray, np.ndarray]:
-    """The policy losses of every seed of runs, at those optimiser steps that all of them have written down.
+    """Read the policy losses of every seed of some runs, at the optimiser steps that all of them have logged.
 
     Args:
-        folders: of runs, with ``seed_N/metrics.jsonl``.
-        held_out: the plain L1 on held-out demonstrations; otherwise what training minimised (with its emphasis,
-            on one batch).
+        folders: run folders with ``seed_N/metrics.jsonl``.
+        held_out: read the plain L1 loss on held-out demonstrations; otherwise the training loss (with its emphasis, on
+            one batch).
 
     Returns:
-        The steps ``[S]`` and the losses ``[R, S]`` of R seeds in all (normalised units).
+        The steps ``[S]`` and the losses ``[R, S]`` of all R seeds (normalised units).
     """
     names = ("held_out_loss",) if held_out else ("loss", "loss_policy")  # decoupled, joint
     curves = [
@@ -120,10 +139,12 @@ def read_losses(folders: list[Path], held_out: bool = True) -> tuple[np.ndarray,
 
 
 def loss_panels(task: str) -> dict[str, dict[str, list[str]]]:
-    """The panels of Fig. 7: title to label to names of cells of recipes/tables.py.
+    """Return the panels of Fig. 7: title to label to names of cells.
 
-    But for the one thing that a panel compares, all of it is decoupled training of recurrent policies, over all
-    supervisions.
+    A panel compares one thing. All else is decoupled training of recurrent policies over all supervisions.
+
+    Args:
+        task: task of the cells.
     """
     supervisions = [some for n in range(len(DYNAMICS) + 1) for some in combinations(DYNAMICS, n)]
 
@@ -147,13 +168,16 @@ def loss_panels(task: str) -> dict[str, dict[str, list[str]]]:
 def plot_losses(
     panels: dict[str, dict[str, list[str]]], runs: Path, missing: list[str], path: Path, held_out: bool = True
 ) -> None:
-    """Policy losses during training (paper, Fig. 7): in each panel a curve for each group of runs, the mean over
-    the seeds of all its runs, and, where there are few groups, one standard deviation.
+    """Draw policy losses during training (paper, Fig. 7).
+
+    A panel has a curve for each group of runs: the mean over the seeds of all its runs, with a band of one standard
+    deviation where there are few groups.
 
     Args:
         panels: see :func:`loss_panels`.
-        runs: the folder that holds the runs of those names.
-        missing: those of them that are not done.
+        runs: folder with the runs of these names.
+        missing: names of runs that are not complete.
+        path: file to write.
         held_out: see :func:`read_losses`.
     """
     figure, axes = plt.subplots(3, 2, figsize=(11, 12), layout="constrained", sharey=True)
@@ -182,15 +206,16 @@ def plot_losses(
         axis.grid(which="both", alpha=0.3)
         axis.legend(fontsize=7)
         if not any(len(line.get_xdata()) for line in axis.lines):
-            _say_not_run(axis)
+            _mark_as_missing(axis)
     save_figure(figure, path)
 
 
 def plot_position_errors(panels: dict[str, TensorDictBase | None], path: Path) -> None:
-    """Position errors along closed-loop episodes (paper, Fig. 8): a panel for each policy.
+    """Draw position errors along closed-loop episodes (paper, Fig. 8), a panel for each policy.
 
     Args:
-        panels: title to episodes ``[E, T]`` of :func:`dynmap_rl.evaluation.roll_out`; None where there is no run.
+        panels: title to episodes ``[E, T]`` of :func:`dynmap_rl.evaluation.roll_out`, or to None where there is no run.
+        path: file to write.
     """
     figure, axes = plt.subplots(
         1, len(panels), figsize=(11, 4.2), layout="constrained", sharex=True, sharey=True
@@ -202,19 +227,21 @@ def plot_position_errors(panels: dict[str, TensorDictBase | None], path: Path) -
         axis.tick_params(labelsize=8, labelleft=True)
         axis.grid(alpha=0.3)
         if episodes is None:
-            _say_not_run(axis)
+            _mark_as_missing(axis)
         else:
             draw_position_errors(axis, episodes)
     save_figure(figure, path)
 
 
-def _say_not_run(axis) -> None:
+def _mark_as_missing(axis) -> None:
     axis.text(0.5, 0.5, "not run", transform=axis.transAxes, ha="center", va="center", fontsize=14)
 
 
 def draw_position_errors(axis, episodes: TensorDictBase) -> None:
-    """The cart's distance from the goal over time in every episode ``[E, T]``; red where the block was dropped in the
-    end, with a dot at that moment."""
+    """Draw the cart's distance from the goal over time for every episode ``[E, T]``.
+
+    Episodes in which the block is dropped are red, with a dot at the moment of the drop.
+    """
     position, dropped = episodes["dynamics", "position"], episodes["next", "dropped"].flatten(1)
     error = 1000 * (position[..., :2] - episodes["goal"]).norm(dim=-1)  # [E, T]
     time = np.arange(error.shape[1]) * CONTROL_DT

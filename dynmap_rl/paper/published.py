@@ -1,8 +1,8 @@
-"""The paper's Tables I, II and III: mean (std) over three policy seeds of DR (%), PE (mm) and SR (%)."""
+"""Numbers of the paper's Tables I, II and III: mean (std) over three policy seeds of DR (%), PE (mm) and SR (%)."""
 
 from __future__ import annotations
 
-METRICS = {  # those that the paper reports for a task
+METRICS = {  # reported metrics of each task
     "balance_reaching": ("DR", "PE", "SR"),
     "balance_reaching_obstacle": ("DR", "SR"),
     "bin_dropping": ("SR",),
@@ -87,15 +87,17 @@ TABLES = {
 
 
 def paper_numbers(result: dict) -> dict[str, tuple[float, float]] | None:
-    """The paper's mean and standard deviation of each metric for the same row, or None where it has no such row.
+    """Return the paper's mean and standard deviation of each metric for the same row; None where it has no such row.
 
     Args:
-        result: an ``eval.json``.
+        result: an ``eval.json`` of a run in closed loop.
     """
     source = result["world_model"]
-    if source["task"] != "balance_reaching":
+    if source.get("task") != "balance_reaching":  # a robot dataset is of no task
         return None
-    column = "decoupled" if source["training"] == "decoupled" else "joint"  # which has the row End-to-End
+    column = (
+        "decoupled" if source["training"] == "decoupled" else "joint"
+    )  # the latter has the row End-to-End
     table = TABLES.get((result["task"], column, result["policy"]), {})
     if result["row"] not in table:
         return None

@@ -18,32 +18,35 @@ from dynmap_rl.data.format.reading import (
     spans,
 )
 from dynmap_rl.keys import DYNAMICS
+
 from .html import write_html
-from dynmap_rl.utils.cli import command_line
 
 EPISODES = 4  # shown
 FRAMES = 120  # of the animation, at most
 WIDEST = 192  # pixels of a frame on the page
 
 
-def write_dataset_page(folder: Path, dataset: str | Path, settings: dict, said: str = "") -> None:
-    """The page, with sizes, ranges of the dynamics, the first episodes as an animation and the dynamics of the first.
+def write_dataset_page(
+    folder: Path, dataset: str | Path, settings: dict, command: str, said: str = ""
+) -> None:
+    """Write the page: sizes, ranges of the dynamics, an animation of the first episodes, dynamics of the first.
 
-    The dataset is done without it: where a page cannot be made, the reason is printed and no error raised.
+    The dataset is complete without its page: if the page cannot be made, the reason is printed and no error is raised.
 
     Args:
-        folder: where ``report.html`` and its pictures are written.
+        folder: folder of ``report.html`` and its pictures.
         dataset: a folder or a hub id.
-        settings: of the recipe that made it.
-        said: what that printed.
+        settings: settings of the recipe that made the dataset.
+        command: command that made the dataset.
+        said: further text for the page.
     """
     try:
-        print(f"written: {_write_page(folder, find_dataset(dataset), settings, said)}")
+        print(f"written: {_write_page(folder, find_dataset(dataset), settings, command, said)}")
     except (OSError, ValueError) as error:
         print(f"no page in {folder}: {error}")
 
 
-def _write_page(folder: Path, root: Path, settings: dict, said: str) -> Path:
+def _write_page(folder: Path, root: Path, settings: dict, command: str, said: str) -> Path:
     info = read_info(root)
     quantities = [q for q in DYNAMICS if f"dynamics.{q}" in info["features"]]
     splits = ", ".join(f"{name} {span}" for name, span in (info.get("splits") or {}).items())
@@ -55,11 +58,11 @@ def _write_page(folder: Path, root: Path, settings: dict, said: str) -> Path:
     _plot_dynamics(root, info, quantities, folder / "dynamics.png")
     if any(feature["dtype"] in ("image", "video") for feature in info["features"].values()):
         _film(root, info, folder / "episodes.gif")
-    return write_html(folder, f"Dataset {root.name}", "\n".join(lines), command_line(), settings)
+    return write_html(folder, f"Dataset {root.name}", "\n".join(lines), command, settings)
 
 
 def _ranges(root: Path, info: dict, quantities: list[str]) -> list[str]:
-    """A line for each entry of the dynamics: smallest, mean and largest."""
+    """Return a line for each entry of the dynamics: smallest, mean and largest value."""
     stats = read_metadata(root / "meta" / "stats.json")
     lines = [f"{'':40} {'min':>10} {'mean':>10} {'max':>10}"]
     for column in (f"dynamics.{quantity}" for quantity in quantities):
@@ -91,7 +94,7 @@ def _plot_dynamics(root: Path, info: dict, quantities: list[str], path: Path) ->
 
 
 def _film(root: Path, info: dict, path: Path) -> None:
-    """The first episodes, of long ones every so many frames; those that end early stand still."""
+    """Write the first episodes; long ones are thinned out, and short ones stand still at their end."""
     from .media import save_gif
 
     episodes = []

@@ -1,4 +1,4 @@
-"""Figures of a run: reconstruction, dynamics prediction (paper, Fig. 6 and 9), rollouts as an animation."""
+"""Figures of world models: reconstruction, predicted dynamics (paper, Fig. 6 and 9), probes, open-loop errors."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from tensordict import TensorDictBase
 from dynmap_rl.envs.tasks import REST_SPEED
 from dynmap_rl.envs.world import CONTROL_DT
 from dynmap_rl.evaluation.probing import STATES
-from dynmap_rl.modules.actor import make_world_model_module
 from dynmap_rl.keys import DYNAMICS
+from dynmap_rl.modules.actor import make_world_model_module
 from dynmap_rl.modules.world_model import WorldModel
 
 matplotlib.use("Agg")
@@ -29,14 +29,14 @@ UNITS = {
 
 @torch.no_grad()
 def predict(world_model: WorldModel, episodes: TensorDictBase) -> TensorDictBase:
-    """The episodes ``[E, T]`` with the world model's one-step predictions."""
+    """Return the episodes ``[E, T]`` with the world model's one-step predictions."""
     return make_world_model_module(world_model)(episodes.select("pixels", "action", "dynamics").clone(False))
 
 
 def plot_reconstruction(
     world_model: WorldModel, episodes: TensorDictBase, path: Path, steps=(1, 8, 16, 24, 60, 110)
 ) -> None:
-    """Held-out frames and their reconstructions from the frame before: one pair of rows an episode."""
+    """Draw frames of episodes ``[E, T]`` and their predictions from the frame before: two rows an episode."""
     steps = [t for t in steps if t < episodes.shape[1]]
     figure = plt.figure(figsize=(1.3 * len(steps), 2.7 * len(episodes)))
     draw_reconstruction(figure, predict(world_model, episodes), [steps] * len(episodes))
@@ -44,7 +44,7 @@ def plot_reconstruction(
 
 
 def plot_dynamics(world_model: WorldModel, episode: TensorDictBase, path: Path) -> None:
-    """The block's true and predicted dynamics along one held-out episode ``[T]``; nothing for an Only-RGB model."""
+    """Draw the block's true and predicted dynamics along one episode ``[T]``; nothing for an Only-RGB model."""
     if not world_model.supervision:
         return
     figure = plt.figure(figsize=(9, 2.2 * len(world_model.supervision)))
@@ -53,8 +53,15 @@ def plot_dynamics(world_model: WorldModel, episode: TensorDictBase, path: Path) 
 
 
 def plot_prediction(world_model: WorldModel, episodes: TensorDictBase, path: Path, title: str) -> None:
-    """Both in one picture (paper, Fig. 6 and 9): the frames of episodes ``[E, T]`` while the block moves, and the
-    dynamics of the first episode."""
+    """Draw frames and dynamics in one picture (paper, Fig. 6 and 9).
+
+    Args:
+        world_model: world model that predicts.
+        episodes: TensorDict ``[E, T]``; frames are taken from the steps in which the block moves, and the dynamics are
+            those of the first episode.
+        path: file to write.
+        title: title of the picture.
+    """
     rows, out = len(world_model.supervision), predict(world_model, episodes)
     heights = [2.5 * len(episodes), 2.0 * rows]
     figure = plt.figure(figsize=(10, 0.5 + sum(heights)), layout="constrained")
@@ -67,7 +74,7 @@ def plot_prediction(world_model: WorldModel, episodes: TensorDictBase, path: Pat
 
 
 def draw_reconstruction(figure, out: TensorDictBase, steps: list[list[int]]) -> None:
-    """Frames of episodes ``[E, T]`` (see :func:`predict`) and their reconstructions, at as many steps of each."""
+    """Draw frames of episodes ``[E, T]`` (see :func:`predict`) and their predictions at the ``steps`` of each."""
     axes = figure.subplots(2 * len(out), len(steps[0]), squeeze=False)
     for row, episode in enumerate(out):
         truth = episode["pixels"].permute(0, 2, 3, 1).numpy()
@@ -84,7 +91,7 @@ def draw_reconstruction(figure, out: TensorDictBase, steps: list[list[int]]) -> 
 
 
 def draw_dynamics(figure, out: TensorDictBase, supervision: tuple[str, ...]) -> None:
-    """The block's dynamics along one episode ``[T]`` (see :func:`predict`): a row for each quantity."""
+    """Draw the block's dynamics along one episode ``[T]`` (see :func:`predict`), a row for each quantity."""
     axes = figure.subplots(len(supervision), 3, squeeze=False, sharex=True)
     time = np.arange(out.shape[0]) * CONTROL_DT
     for row, quantity in enumerate(supervision):
@@ -101,7 +108,7 @@ def draw_dynamics(figure, out: TensorDictBase, supervision: tuple[str, ...]) -> 
 
 
 def moving_steps(episode: TensorDictBase, count: int, first: int = 0) -> list[int]:
-    """``count`` steps of an episode ``[T]``, evenly spaced from ``first`` to the last in which the block moves."""
+    """Return ``count`` steps of an episode ``[T]``, evenly spaced from ``first`` to the block's last movement."""
     speed = episode["dynamics", "velocity"][:, 3:5].norm(dim=-1)
     moving = (speed > REST_SPEED).nonzero().flatten().tolist()
     last = min(max([first + count - 1, *moving[-1:]]), len(speed) - 1)
@@ -109,11 +116,11 @@ def moving_steps(episode: TensorDictBase, count: int, first: int = 0) -> list[in
 
 
 def plot_distributions(dynamics: dict[str, TensorDictBase], path: Path) -> dict[str, dict[str, list[float]]]:
-    """Histograms of the angles and angular velocities of cart and block, the tasks side by side.
+    """Draw histograms of the angles and angular velocities of cart and block, a row for each task.
 
     Args:
-        dynamics: task name to ``position`` and ``velocity`` ``[E, T, 6]``.
-        path: of the picture.
+        dynamics: ``position`` and ``velocity`` ``[E, T, 6]`` by name of the task.
+        path: file to write.
 
     Returns:
         For each task and each histogram the 0.1, 50 and 99.9 % quantiles of the magnitude (rad, rad/s).
@@ -140,7 +147,7 @@ def plot_distributions(dynamics: dict[str, TensorDictBase], path: Path) -> dict[
 
 
 def save_figure(figure, path: Path) -> None:
-    """Write the picture and close the figure, laid out tightly where it has no layout of its own."""
+    """Write a figure and close it; a figure without a layout engine is laid out tightly."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if figure.get_layout_engine() is None:
         figure.tight_layout()
@@ -149,12 +156,17 @@ def save_figure(figure, path: Path) -> None:
 
 
 def plot_probes(probes: dict[str, dict], path: Path) -> None:
-    """R^2 of :func:`probe`, mean over the entries of a quantity: a panel a state, a row a world model by its name."""
+    """Draw R^2, averaged over the entries of a quantity: a panel for each state, a row for each world model.
+
+    Args:
+        probes: results of :func:`dynmap_rl.evaluation.probe` by name of the world model.
+        path: file to write.
+    """
     figure, axes = plt.subplots(
         1, len(STATES), figsize=(11, 1.5 + 0.4 * len(probes)), layout="constrained", sharey=True
     )
     figure.suptitle(
-        "How much of the dynamics a linear map of a state tells (R$^2$, held-out demonstrations)", fontsize=11
+        "R$^2$ of linear maps from the states to the dynamics (held-out demonstrations)", fontsize=11
     )
     for axis, state in zip(axes, STATES, strict=True):
         values = np.array([[np.mean(p[state][q]) for q in DYNAMICS] for p in probes.values()])
@@ -169,15 +181,20 @@ def plot_probes(probes: dict[str, dict], path: Path) -> None:
 
 
 def plot_open_loop(errors: dict[str, dict], path: Path) -> None:
-    """Errors of :func:`open_loop_errors` over the horizon: a curve a world model, dotted where all stays as last seen."""
+    """Draw errors over the horizon: a curve for each world model, and a dotted one for the constant last pose.
+
+    Args:
+        errors: results of :func:`dynmap_rl.evaluation.open_loop_errors` by name of the world model.
+        path: file to write.
+    """
     figure, axes = plt.subplots(2, 2, figsize=(10, 7), layout="constrained", sharex=True)
-    figure.suptitle("Open-loop prediction: actions are given, frames are not", fontsize=11)
+    figure.suptitle("Open-loop prediction from actions without frames", fontsize=11)
     for axis, key in zip(axes.T.flat, ("cart_mm", "cart_deg", "block_mm", "block_deg"), strict=True):
         body, unit = key.split("_")
         for number, (name, error) in enumerate(errors.items()):
             time = [CONTROL_DT * (step + 1) for step in range(len(error["model"][key]))]
             axis.plot(time, error["model"][key], f"C{number}", lw=1.3, label=name)
-        axis.plot(time, error["still"][key], "k:", lw=1, label="all stays where it was")
+        axis.plot(time, error["still"][key], "k:", lw=1, label="constant last pose")
         axis.set_ylabel(f"{body}, mean error [{unit}]", fontsize=9)
         axis.grid(alpha=0.3)
         axis.set_ylim(bottom=0)

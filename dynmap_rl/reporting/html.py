@@ -1,10 +1,11 @@
-"""``report.html``: a run folder as one page that needs nothing beside it."""
+"""``report.html``: a run folder as one self-contained page."""
 
 from __future__ import annotations
 
 import base64
 import html
 import io
+from collections.abc import Iterator
 from pathlib import Path
 
 from dynmap_rl.runs.folder import read_metrics
@@ -18,10 +19,10 @@ table { border-collapse: collapse } td, th { padding: .15em .8em; border-bottom:
 TYPES = {".png": "image/png", ".gif": "image/gif"}
 PICTURES = {  # in this order
     "rollouts.gif": "Rollouts in closed loop, failures first",
-    "figures/reconstruction.png": "Held-out frames, and what the world model predicted from the frame before",
+    "figures/reconstruction.png": "Held-out frames, and their predictions from the frame before",
     "figures/dynamics.png": "The block's dynamics along a held-out episode, true and predicted",
-    "open_loop.png": "Open-loop prediction: its error against the time without frames",
-    "probes.png": "How much of the dynamics a linear map reads out of each state",
+    "open_loop.png": "Error of open-loop predictions against the time without frames",
+    "probes.png": "R^2 of linear maps from the states to the dynamics",
     "episodes.gif": "Some of the episodes",
     "dynamics.png": "The dynamics of the first episode",
 }
@@ -35,15 +36,18 @@ def write_html(
     settings: dict | None = None,
     pictures: dict[str, str] = PICTURES,
 ) -> Path:
-    """Write ``report.html``: the table row, animations and figures, curves, settings, the command.
+    """Write ``report.html``: result, animations and figures, curves, settings and command on one page.
 
     Args:
-        folder: of a run, with whatever of ``metrics.jsonl``, ``seed_N/metrics.jsonl`` and figures there is.
-        title: of the page.
+        folder: folder with any of ``metrics.jsonl``, ``seed_N/metrics.jsonl`` and the pictures.
+        title: title of the page.
         row: the result, as text.
-        command: that made it.
-        settings: those of ``config.json`` in the folder unless others are given.
-        pictures: files in the folder, with their captions; those that are not there are left out.
+        command: command that made the result.
+        settings: settings, possibly nested; by default those of ``config.json`` in the folder.
+        pictures: captions of files in the folder; missing files are left out.
+
+    Returns:
+        The path of the page.
     """
     parts = [f"<h1>{html.escape(title)}</h1>", f"<pre>{html.escape(row.strip())}</pre>"]
     for name, caption in pictures.items():
@@ -59,7 +63,7 @@ def write_html(
     settings = read_json(folder / "config.json") if settings is None else settings
     cells = "".join(
         f"<tr><td>{html.escape(name)}</td><td>{html.escape(str(value))}</td></tr>"
-        for name, value in settings.items()
+        for name, value in _flatten(settings)
     )
     parts += ["<h2>Settings</h2>", f"<table>{cells}</table>"]
     parts += [f"<pre>{html.escape(command)}</pre>"] if command else []
@@ -71,8 +75,22 @@ def write_html(
     return folder / "report.html"
 
 
+def _flatten(settings: dict, prefix: str = "") -> Iterator[tuple[str, object]]:
+    """Yield the entries of nested settings with dotted names, such as ``world_model.updates``."""
+    for name, value in settings.items():
+        if isinstance(value, dict):
+            yield from _flatten(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
 def draw_curves(curves: dict[str, list[dict]], columns: int = 3) -> str:
-    """All metrics over the steps as one SVG, a panel a metric, a line for each of the folders they are from."""
+    """Return all metrics over the steps as one SVG.
+
+    Args:
+        curves: rows of ``metrics.jsonl`` by label; every metric gets a panel, and every label a line in it.
+        columns: panels in a row.
+    """
     from .figures import plt
 
     names = list(

@@ -1,4 +1,4 @@
-"""The state-based expert: its network and the checkpoints that ship with the package (paper, Sec. IV-C)."""
+"""Animations of episodes."""
 
 from __future__ import annotations
 
@@ -11,32 +11,21 @@ from PIL import Image
 from tensordict.nn import TensorDictModuleBase
 
 from dynmap_rl.envs.renderer import Renderer
-from dynmap_rl.envs.tasks import BalanceReaching
-from dynmap_rl.evaluation.protocol import _rows
+from dynmap_rl.envs.task import Task
+from dynmap_rl.evaluation.protocol import unpack_rows
 from dynmap_rl.evaluation.rollout import failures_first, roll_out
 from dynmap_rl.experts.network import ExpertNetwork, play
 
 
-def film(
-    network: ExpertNetwork,
-    task: BalanceReaching,
-    scene_seeds: Sequence[int],
-    path: Path,
-    states: BalanceReaching | None = None,
-) -> None:
-    """:func:`play` as an animation."""
-    from .media import save_gif
-
-    renderer = Renderer()
-    steps = play(network, task, scene_seeds, states)
-    frames = np.stack(
-        [[renderer.draw(world, task) for world in worlds] for worlds in steps], 1
-    )  # [E, T, ...]
-    save_gif(torch.from_numpy(frames).permute(0, 1, 4, 2, 3), path)
-
-
 def save_gif(pixels: torch.Tensor, path: Path, columns: int = 4, scale: int = 3) -> None:
-    """Frames ``[E, T, 3, H, W]`` of E episodes as one animation, 20 steps a second."""
+    """Write episodes side by side as one animation of 20 steps a second.
+
+    Args:
+        pixels: frames uint8 ``[E, T, 3, H, W]``.
+        path: file to write.
+        columns: episodes in a row.
+        scale: pixels of the animation for a pixel of a frame.
+    """
     episodes, steps, _, height, width = pixels.shape
     rows = -(-episodes // columns)
     frames = pixels.permute(1, 0, 3, 4, 2).numpy()  # (T, E, H, W, 3)
@@ -49,10 +38,33 @@ def save_gif(pixels: torch.Tensor, path: Path, columns: int = 4, scale: int = 3)
     images[0].save(path, save_all=True, append_images=images[1:], duration=50, loop=0, optimize=True)
 
 
-def film_policy(actor: TensorDictModuleBase, task: str, rows: dict, path: Path) -> None:
-    """Some of the episodes whose ``rows`` :func:`evaluate` gave as an animation, failures first."""
-    from .media import save_gif
+def film(
+    network: ExpertNetwork, task: Task, scene_seeds: Sequence[int], path: Path, states: Task | None = None
+) -> None:
+    """Write episodes of an expert as an animation.
 
-    rows = _rows(rows)
+    Args:
+        network: the expert.
+        task: the task to film.
+        scene_seeds: seeds of the scenes, an episode each.
+        path: file to write.
+        states: task whose states the expert reads; by default ``task``.
+    """
+    renderer = Renderer()
+    steps = play(network, task, scene_seeds, states)
+    frames = np.stack([[renderer.draw(world, task) for world in worlds] for worlds in steps], 1)
+    save_gif(torch.from_numpy(frames).permute(0, 1, 4, 2, 3), path)
+
+
+def film_policy(actor: TensorDictModuleBase, task: str, rows: dict, path: Path) -> None:
+    """Write eight evaluated episodes as an animation, failures first.
+
+    Args:
+        actor: the actor that was evaluated.
+        task: name of the task.
+        rows: ``rows`` of the result of :func:`dynmap_rl.evaluation.evaluate`.
+        path: file to write.
+    """
+    rows = unpack_rows(rows)
     some = failures_first([row["scene_seed"] for row in rows], [row["success"] for row in rows])
     save_gif(roll_out(actor, task, some, keep_pixels=True)["pixels"], path)

@@ -1,84 +1,99 @@
-"""The result of a run on a dataset that no simulator belongs to: held-out errors in the place of DR, PE and SR."""
+"""Result of a run on a robot dataset: errors on held-out episodes, since there is no simulator."""
 
 from __future__ import annotations
 
-import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from tensordict import TensorDictBase
 
-from dynmap_rl.data.robot import describe_foreign
-from dynmap_rl.evaluation.errors import prediction_errors
+from dynmap_rl.data.robot import describe_robot_dataset
 from dynmap_rl.modules.supervision import row_name
 from dynmap_rl.modules.world_model import WorldModel
-from .html import write_html
-from dynmap_rl.utils.cli import command_line
 from dynmap_rl.utils.files import write_json
 
+from .html import write_html
+from .run_page import read_results
 
-def write_held_out(
+
+def write_robot_report(
     folder: Path,
-    settings,
-    dataset,
     world_model: WorldModel,
     episodes: TensorDictBase,
-    results: list[dict],
-    seeds: list[int],
+    seeds: Sequence[int],
+    *,
+    dataset: str | Path,
+    camera: str | None,
+    goal: str | None,
+    policy: str,
+    source: dict[str, str],
+    settings: dict,
+    command: str,
     frozen: str | None = None,
-    source: dict | None = None,
 ) -> dict:
-    """Collect the ``results`` of the seeds into ``eval.json``; for the other arguments see ``write_report``.
+    """Collect the results of all seeds, draw a figure, and write ``eval.json`` and ``report.html``.
 
-    ``held_out`` has ``rgb`` (root mean square, 0..1), ``imitation_l1`` (normalised) and, in the dataset's units, the
-    mean absolute error of every entry of the supervised dynamics, one step ahead, and of the action: means over the
-    seeds. ``spread`` has that of the best constant, which knows the held-out pieces but no frame.
+    Args:
+        folder: run folder with ``seed_N/eval.json`` (see :func:`dynmap_rl.evaluation.judge_held_out`).
+        world_model: the frozen world model, or that of the first seed.
+        episodes: held-out pieces of episodes ``[P, T]``.
+        seeds: seeds of the policies.
+        dataset: robot dataset, a folder or a hub id.
+        camera: camera's column; None is the first camera.
+        goal: goal's column and entries, or None.
+        policy: kind of the policies, ``feedforward`` or ``recurrent``.
+        source: origin of the world model, with ``dataset`` and ``training`` (decoupled or joint).
+        settings: settings of the run, as a nested dict of JSON values.
+        command: command that started the run.
+        frozen: fingerprint of the frozen world model; None where every seed has a world model of its own.
+
+    Returns:
+        The content of ``eval.json``. ``held_out`` has means over the seeds: ``rgb`` (root mean square, 0 to 1),
+        ``imitation_l1`` (normalised) and, in the dataset's units, the mean absolute error of every entry of the action
+        and of the supervised dynamics, one step ahead. ``spread`` has the mean absolute error of the best constant.
+
+    Raises:
+        ValueError: a seed was evaluated with another world model.
     """
     from .figures import plot_reconstruction
 
+    results = read_results(folder, seeds, frozen)
     errors = {k: float(np.mean([r["held_out"][k] for r in results])) for k in results[0]["held_out"]}
-    if frozen:  # one world model for all seeds, which have not judged it
-        world_model.cpu()  # as the episodes are
-        errors |= prediction_errors(world_model, episodes, by_entry=True)
-    names = describe_foreign(dataset, settings.camera, settings.goal)["names"]
+    names = describe_robot_dataset(dataset, camera, goal)["names"]
     names = {key: names[key] for key in (*world_model.supervision, "action")}
-    training = {"task": settings.task, "training": "decoupled", "dataset": str(dataset)}
     result = {
-        "row": row_name(world_model.supervision, (source or training)["training"]),
-        "policy": settings.policy,
-        "task": settings.task,
+        "row": row_name(world_model.supervision, source["training"]),
+        "policy": policy,
         "trained_on": {
             "dataset": str(dataset),
             "held_out_episodes": episodes["episode"].unique().tolist(),
             "held_out_pieces": list(episodes.shape),
         },
-        "world_model": source or training,
+        "world_model": source,
         "seeds": list(seeds),
         "world_model_sha256": frozen,
         "held_out": {"rgb": errors["error_rgb"], "imitation_l1": errors["imitation_l1"]}
         | {q: {n: errors[f"error_{q}_{i}"] for i, n in enumerate(own)} for q, own in names.items()},
         "spread": {q: dict(zip(own, _spread(episodes, q), strict=True)) for q, own in names.items()},
-        "settings": {
-            k: str(v) if isinstance(v, Path) else v for k, v in dataclasses.asdict(settings).items()
-        },
-        "command": command_line(),
+        "settings": settings,
+        "command": command,
         "results": results,
     }
-    path = folder / "figures" / "reconstruction.png"
-    plot_reconstruction(world_model.cpu(), episodes[:3], path)
-    title = f"{result['row']}, {settings.policy} policy, {dataset}"
-    write_html(folder, title, held_out_text(result), result["command"])
-    write_json(folder / "eval.json", result)  # last: it says that all is done
+    plot_reconstruction(world_model.cpu(), episodes[:3], folder / "figures" / "reconstruction.png")
+    title = f"{result['row']}, {policy} policy, {dataset}"
+    write_html(folder, title, robot_row_text(result), command, settings)
+    write_json(folder / "eval.json", result)  # last: it marks the run as complete
     return result
 
 
-def held_out_text(result: dict) -> str:
-    """The row of a dataset without a simulator, as lines of text."""
+def robot_row_text(result: dict) -> str:
+    """Return the result of :func:`write_robot_report` as lines of text."""
     errors, trained_on = result["held_out"], result["trained_on"]
     held_out = len(trained_on["held_out_episodes"])
     lines = [
         f"{result['row']}, {result['policy']} policy, {trained_on['dataset']}",
-        f"  held-out errors on {held_out} episodes; without a simulator there is no closed loop, no DR, PE or SR",
+        f"  held-out errors on {held_out} episodes; there is no simulator, thus no DR, PE or SR",
         f"  rgb {errors['rgb']:.4f} (root mean square)   imitation L1 {errors['imitation_l1']:.4f} (normalised)",
     ]
     for quantity, constant in result["spread"].items():

@@ -1,137 +1,160 @@
-"""What a run leaves behind: ``eval.json``, the table row beside the paper's, figures, an animation, ``report.html``."""
+"""Result of a run in closed loop: ``eval.json``, figures, an animation and ``report.html``."""
 
 from __future__ import annotations
 
-import dataclasses
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 from tensordict import TensorDictBase
 
-from dynmap_rl.data.demonstrations import load_meta
-from dynmap_rl.envs.tasks import NO_TASK
-from dynmap_rl.evaluation.protocol import _rows, result_rows
+from dynmap_rl.data.demonstrations import find_meta
+from dynmap_rl.data.format.reading import find_dataset
+from dynmap_rl.evaluation.protocol import result_rows, unpack_rows
 from dynmap_rl.evaluation.statistics import shared_interval, summarize, summarize_seeds
 from dynmap_rl.modules.actor import Actor
 from dynmap_rl.modules.checkpoints import load_policy
 from dynmap_rl.modules.supervision import row_name
 from dynmap_rl.modules.world_model import WorldModel
-from dynmap_rl.paper.published import METRICS, paper_numbers
-from .html import write_html
-from .media import film_policy
-from .robot_page import held_out_text, write_held_out
-from dynmap_rl.utils.cli import command_line
 from dynmap_rl.utils.files import read_json, write_json
 
+from .html import write_html
+from .media import film_policy
+
 UNITS = {"DR": "%", "PE": "mm", "SR": "%"}
+
+Numbers = dict[str, tuple[float, float]]  # metric to mean and standard deviation
 
 
 def write_report(
     folder: Path,
-    settings,
-    dataset,
     world_model: WorldModel,
     episodes: TensorDictBase,
-    seeds: list[int],
+    seeds: Sequence[int],
+    *,
+    task: str,
+    dataset: str | Path,
+    policy: str,
+    source: dict[str, str],
+    settings: dict,
+    command: str,
     frozen: str | None = None,
-    source: dict | None = None,
+    compare: Callable[[dict], Numbers | None] | None = None,
 ) -> dict:
-    """Collect the seeds' results into ``eval.json`` and draw the figures.
+    """Collect the results of all seeds, draw figures and an animation, and write ``eval.json`` and ``report.html``.
 
     Args:
         folder: run folder with ``seed_N/eval.json`` and ``seed_N/policy``.
-        settings: the recipe's dataclass.
-        dataset: what was trained on.
-        world_model: the frozen one, of which ``frozen`` is the fingerprint, or that of the first seed.
+        world_model: the frozen world model, or that of the first seed.
         episodes: held-out demonstrations ``[E, T]``, for the figures.
-        seeds: of the policies.
-        source: where the world model is from, with its ``task`` and ``training``; by default this very run.
+        seeds: seeds of the policies.
+        task: name of the task of the policies.
+        dataset: demonstrations that the policies were trained on, a folder or a hub id.
+        policy: kind of the policies, ``feedforward`` or ``recurrent``.
+        source: origin of the world model, with ``task`` and ``training`` (decoupled, joint or end_to_end).
+        settings: settings of the run, as a nested dict of JSON values.
+        command: command that started the run.
+        frozen: fingerprint of the frozen world model; None where every seed has a world model of its own.
+        compare: function from the result to published numbers for the same row (see :func:`row_text`), or to None.
 
-    A dataset of no task has no simulator to act in: see :func:`dynmap_rl.evaluation.write_held_out`.
+    Returns:
+        The content of ``eval.json``.
+
+    Raises:
+        ValueError: a seed was evaluated with another world model.
     """
-    from .figures import plot_dynamics, plot_reconstruction
-
-    results = [read_json(folder / f"seed_{seed}" / "eval.json") for seed in seeds]
-    if frozen and any(r["world_model_sha256"] != frozen for r in results):
-        raise ValueError(f"seeds in {folder} belong to another world model; delete the folder and run again")
-    if settings.task == NO_TASK:
-        return write_held_out(
-            folder, settings, dataset, world_model, episodes, results, seeds, frozen, source
-        )
-    meta = load_meta(dataset)
-    source = source or {"task": settings.task, "training": "decoupled"}
-    test = [_rows(r["test"]["rows"]) for r in results]
+    results = read_results(folder, seeds, frozen)
+    test = [unpack_rows(r["test"]["rows"]) for r in results]
     result = {
         "row": row_name(world_model.supervision, source["training"]),
-        "policy": settings.policy,
-        "task": settings.task,
-        "trained_on": {"dataset": str(dataset), "kind": meta["kind"], "episodes": meta["splits"]["train"][1]},
+        "policy": policy,
+        "task": task,
+        "trained_on": _describe(dataset),
         "world_model": source,
         "seeds": list(seeds),
         "world_model_sha256": frozen,
-        "paper_protocol": summarize_seeds([_rows(r["paper"]["rows"]) for r in results]),
+        **_paper_protocol(results),
         "test_protocol": summarize([row for rows in test for row in rows])
         | {"SR_interval": shared_interval(test), "DR_interval": shared_interval(test, "dropped")}
         | _localization(results),
-        "settings": {
-            k: str(v) if isinstance(v, Path) else v for k, v in dataclasses.asdict(settings).items()
-        },
-        "command": command_line(),
+        "settings": settings,
+        "command": command,
         "results": results,
     }
-    world_model.cpu()  # as the episodes are
-    if source["training"] != "end_to_end":  # whose decoders are not trained
-        plot_reconstruction(world_model, episodes[:3], folder / "figures" / "reconstruction.png")
-    plot_dynamics(world_model, episodes[0], folder / "figures" / "dynamics.png")
-    policy = load_policy(folder / f"seed_{seeds[0]}" / "policy")
-    film_policy(
-        Actor(world_model, policy, mixed=True),
-        settings.task,
-        results[0]["test"]["rows"],
-        folder / "rollouts.gif",
-    )
-    write_html(folder, _title(result), row_text(result), result["command"])
-    write_json(folder / "eval.json", result)  # last: it says that all is done
+    _draw(folder, world_model, episodes, result)
+    published = compare(result) if compare else None
+    write_html(folder, _title(result), row_text(result, published), command, settings)
+    write_json(folder / "eval.json", result)  # last: it marks the run as complete
     return result
 
 
+def read_results(folder: Path, seeds: Sequence[int], frozen: str | None) -> list[dict]:
+    """Read ``seed_N/eval.json`` of every seed.
+
+    Args:
+        folder: run folder.
+        seeds: seeds of the policies.
+        frozen: fingerprint that every result must have, or None.
+
+    Raises:
+        ValueError: a result has another fingerprint.
+    """
+    results = [read_json(folder / f"seed_{seed}" / "eval.json") for seed in seeds]
+    if frozen and any(result["world_model_sha256"] != frozen for result in results):
+        raise ValueError(f"seeds in {folder} belong to another world model; delete the folder and run again")
+    return results
+
+
+def _describe(dataset: str | Path) -> dict:
+    """Return name, kind and number of training episodes; a dataset edited by other tools has only a name."""
+    meta = find_meta(find_dataset(dataset))
+    facts = {"kind": meta["kind"], "episodes": meta["splits"]["train"][1]} if meta else {}
+    return {"dataset": str(dataset)} | facts
+
+
+def _paper_protocol(results: list[dict]) -> dict:
+    """Return the summary by the paper's protocol, unless no episode was run by it."""
+    if any("paper" not in result for result in results):
+        return {}
+    return {"paper_protocol": summarize_seeds([unpack_rows(r["paper"]["rows"]) for r in results])}
+
+
 def _localization(results: list[dict]) -> dict[str, float]:
-    """How well the world model finds the cart (mm), over all seeds; rows do not tell it."""
+    """Return the mean over the seeds of the world model's errors in the cart's position (mm)."""
     names = [name for name in results[0]["test"]["summary"] if name.startswith("localization")]
     return {name: float(np.mean([r["test"]["summary"][name] for r in results])) for name in names}
 
 
-def print_row(result: dict) -> None:
-    """The table row, beside the paper's."""
-    print(f"\n{row_text(result)}")
+def _draw(folder: Path, world_model: WorldModel, episodes: TensorDictBase, result: dict) -> None:
+    from .figures import plot_dynamics, plot_reconstruction
+
+    world_model.cpu()  # as the episodes are
+    if result["world_model"]["training"] != "end_to_end":  # its decoders are not trained
+        plot_reconstruction(world_model, episodes[:3], folder / "figures" / "reconstruction.png")
+    plot_dynamics(world_model, episodes[0], folder / "figures" / "dynamics.png")
+    policy = load_policy(folder / f"seed_{result['seeds'][0]}" / "policy")
+    actor, rows = Actor(world_model, policy, mixed=True), result["results"][0]["test"]["rows"]
+    film_policy(actor, result["task"], rows, folder / "rollouts.gif")
 
 
-def row_text(result: dict) -> str:
-    """The same as lines of text."""
-    if result["task"] == NO_TASK:
-        return held_out_text(result)
-    ours, test, paper = result["paper_protocol"], result["test_protocol"], paper_numbers(result)
+def row_text(result: dict, published: Numbers | None = None) -> str:
+    """Return the row of a result as lines of text.
+
+    Args:
+        result: an ``eval.json``.
+        published: mean and standard deviation of each published metric of the same row, for comparison. Only these
+            metrics are shown.
+    """
+    test, names = result["test_protocol"], list(published or UNITS)
     low, high = shared_interval(result_rows(result))
-    values = "   ".join(f"{name} {test[name]:.1f} {UNITS[name]}" for name in _metrics(result))
-    lines = [
-        _title(result),
-        "  paper's protocol  " + _cells({name: ours[name] for name in _metrics(result)}),
-        *(["  paper             " + _cells(paper)] if paper else []),
-        f"  {test['episodes']} episodes     {values} [{low:.1f}, {high:.1f}]",
-    ]
+    values = "   ".join(f"{name} {test[name]:.1f} {UNITS[name]}" for name in names)
+    lines = [_title(result)]
+    if ours := result.get("paper_protocol"):
+        lines.append("  paper's protocol  " + _cells({name: ours[name] for name in names}))
+    if published:
+        lines.append("  paper             " + _cells(published))
+    lines.append(f"  {test['episodes']} episodes     {values} [{low:.1f}, {high:.1f}]")
     return "\n".join(lines)
-
-
-def markdown_row(result: dict) -> str:
-    """A row of the README's tables: the paper's numbers, ours by its protocol, ours on the shared start states, and there
-    the SR of each policy."""
-    test, paper = result["test_protocol"], paper_numbers(result)
-    low, high = shared_interval(result_rows(result))
-    others = [f"{test[name]:.1f}" for name in _metrics(result) if name != "SR"]
-    ours = _short({name: result["paper_protocol"][name] for name in _metrics(result)})
-    rate = f"**{test['SR']:.1f}** [{low:.1f}, {high:.1f}]"
-    each = ", ".join(f"{100 * np.mean([row['success'] for row in rows]):.1f}" for rows in result_rows(result))
-    return f"| {' | '.join([result['row'], _short(paper) if paper else '-', ours, *others, rate, each])} |"
 
 
 def _title(result: dict) -> str:
@@ -139,21 +162,11 @@ def _title(result: dict) -> str:
 
 
 def _label(result: dict) -> str:
-    """The row's name, with what its world model is from where that is not the decoupled training on the same task."""
+    """Return the row's name, and the origin of its world model unless that is decoupled training on the same task."""
     source = result["world_model"]
     label = f"{result['row']}, joint" if source["training"] == "joint" else result["row"]
     return label if source["task"] == result["task"] else f"{label} of {source['task']}"
 
 
-def _metrics(result: dict) -> tuple[str, ...]:
-    return METRICS.get(result["task"], tuple(UNITS))
-
-
-def _short(numbers: dict) -> str:
-    mean, std = numbers["SR"]
-    others = ", ".join(f"{numbers[name][0]:.0f}" for name in numbers if name != "SR")
-    return f"{mean:.0f} ({std:.1f})" + (f"; {others}" if others else "")
-
-
-def _cells(numbers: dict) -> str:
+def _cells(numbers: Numbers) -> str:
     return "   ".join(f"{name} {mean:.0f} ({std:.1f}) {UNITS[name]}" for name, (mean, std) in numbers.items())

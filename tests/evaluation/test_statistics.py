@@ -1,15 +1,17 @@
+"""Rates, their intervals and their comparison, against SciPy and against numbers by hand."""
+
 import numpy as np
 import pytest
 from scipy.stats import permutation_test
 
-from dynmap_rl.modules.supervision import parse_supervision
-from dynmap_rl.evaluation.statistics import rate_gap
-from dynmap_rl.modules.supervision import row_name
-from dynmap_rl.evaluation.statistics import shared_interval
-from dynmap_rl.evaluation.statistics import summarize
-from dynmap_rl.evaluation.statistics import summarize_seeds
-from dynmap_rl.evaluation.statistics import wilson
-from dynmap_rl.evaluation.statistics import exchange_p
+from dynmap_rl.evaluation.statistics import (
+    exchange_p,
+    rate_gap,
+    shared_interval,
+    summarize,
+    summarize_seeds,
+    wilson,
+)
 
 
 def rows(successes, dropped=0, count=10, error=0.02):
@@ -109,12 +111,3 @@ def test_gap_refuses_other_start_states():
     other = [dict(row, scene_seed=row["scene_seed"] + 1) for row in rows(5)]
     with pytest.raises(ValueError, match="start states"):
         rate_gap([rows(5)], [other])
-
-
-def test_row_names_are_the_paper_s():
-    assert row_name(()) == "Only-RGB"
-    assert row_name(("velocity", "position")) == "RGB+[P+V]"
-    assert parse_supervision("none") == ()
-    assert parse_supervision("velocity, position") == ("position", "velocity")
-    with pytest.raises(ValueError, match="jerk"):
-        parse_supervision("jerk")

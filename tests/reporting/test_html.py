@@ -39,7 +39,7 @@ class Page(HTMLParser):
 
 @pytest.fixture
 def folder(tmp_path):
-    write_json(tmp_path / "config.json", {"task": "<script>alert(1)</script>", "updates": 7})
+    write_json(tmp_path / "config.json", {"task": "<script>alert(1)</script>", "world_model": {"updates": 7}})
     for step in (1, 2, 3):
         append_metrics(tmp_path, step, loss_rgb=1 / step, error_position=0.1)
         append_metrics(tmp_path / "seed_0", step, loss=1 / step, seconds=None)
@@ -52,7 +52,7 @@ def test_the_page_is_whole_and_needs_nothing_beside_it(folder):
     text = write_html(folder, "RGB+[P] & more", "SR 50 %", command).read_text()
     page = Page(text)
     assert page.open == []
-    for said in ("RGB+[P] & more", "SR 50 %", "updates", command):
+    for said in ("RGB+[P] & more", "SR 50 %", "world_model.updates", command):
         assert said in page.text
     assert not any(tag in ("script", "link", "iframe") for tag, *_ in page.attributes)
     assert "<script>" not in text
@@ -73,6 +73,7 @@ def test_a_run_without_results_has_a_page_too(tmp_path):
     assert "seed" in Page(write_html(tmp_path, "title", "row").read_text()).text
 
 
+@pytest.mark.slow
 def test_a_browser_shows_the_whole_page_and_asks_for_nothing_else(folder, tmp_path):
     rng = np.random.default_rng(0)
     frames = [Image.fromarray(rng.integers(0, 255, (64, 96, 3), dtype=np.uint8)) for _ in range(3)]

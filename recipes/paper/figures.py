@@ -1,21 +1,19 @@
-"""Draw the paper's figures from our own runs, those of recipes/tables.py, and from the datasets.
+"""Draw the paper's figures from the runs of recipes/paper/tables.py and from the datasets.
 
-    python recipes/figures.py
-    python recipes/figures.py --only fig2,fig7,distributions
+    python recipes/paper/figures.py
+    python recipes/paper/figures.py --only fig2,fig7,distributions
 
-Fig. 2 to 4 show demonstrations, Fig. 6 and 9 what a world model of task 1 predicts on tasks 1 and 3, Fig. 7 policy
-losses, Fig. 8 closed-loop episodes; Fig. 1 and 5 are diagrams. ``distributions`` shows how the angles and angular
-velocities of the tasks are distributed, with their ranges as JSON. What a missing run leaves out is said. All of them are
-on one page, `report.html`.
+Fig. 2 to 4 show demonstrations, Fig. 6 and 9 predictions of a world model of task 1 on tasks 1 and 3, Fig. 7 policy
+losses, Fig. 8 closed-loop episodes; Fig. 1 and 5 of the paper are diagrams. The figure distributions shows angles and
+angular velocities in the demonstrations, with their ranges as JSON. The page report.html shows all figures.
 """
 
-import dataclasses
+import sys
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from dynmap_rl.utils.cli import command_line
-from dynmap_rl.utils.cli import run_recipe
+from dynmap_rl.utils.cli import command_line, run_recipe
 
 TASKS = {
     "balance_reaching": "Task 1: Balance-Reaching",
@@ -23,31 +21,35 @@ TASKS = {
     "bin_dropping": "Task 3: Bin-Dropping",
 }
 ONE, _, THREE = TASKS
-WORLD_MODEL = f"{ONE}_decoupled_position_velocity_acceleration_recurrent"  # of Fig. 6 and 9
-POLICIES = {  # of Fig. 8
+WORLD_MODEL = f"{ONE}_decoupled_position_velocity_acceleration_recurrent"  # for Fig. 6 and 9
+POLICIES = {  # for Fig. 8
     "(a) Only-RGB, feedforward policy": f"{ONE}_decoupled_none_feedforward",
     "(b) RGB+[P+V], recurrent policy": f"{ONE}_decoupled_position_velocity_recurrent",
 }
 
 
-@dataclass
+@dataclass(frozen=True)
 class Config:
-    # Folder with the runs of recipes/tables.py.
+    """Settings of the recipe."""
+
+    # Folder with the runs of recipes/paper/tables.py.
     runs: Path = Path("runs/tables")
     # Folder of the figures.
     output: Path = Path("runs/figures")
-    # Names of figures, separated by commas; by default all.
+    # Names of figures, such as fig2,fig7; by default all.
     only: str = ""
-    # Datasets, folders or hub ids, separated by commas; by default datasets/TASK, recorded where it is not there.
+    # Datasets with commas between, folders or hub ids; by default datasets/TASK, recorded where they are missing.
     datasets: str | None = None
 
 
 def main(config: Config) -> None:
+    """Draw the figures and a page; a figure that cannot be drawn is an error at the end."""
     from dynmap_rl.reporting.html import write_html
+    from dynmap_rl.runs.folder import plain_settings
 
     names = [name.strip() for name in config.only.split(",")] if config.only else list(FIGURES)
     if unknown := [name for name in names if name not in FIGURES]:
-        raise ValueError(f"--only: no figure {', '.join(unknown)}; choose from {', '.join(FIGURES)}")
+        raise ValueError(f"--only must be any of {', '.join(FIGURES)}, got {', '.join(unknown)}")
     datasets = name_datasets(config)
     drawn, missing = [], []
     for name in names:
@@ -59,14 +61,15 @@ def main(config: Config) -> None:
             missing.append(f"{name}: {error}")
     if drawn:
         captions = {f"{name}.png": caption for name, (_, caption) in FIGURES.items()}
-        said, settings = "\n".join([f"drawn: {', '.join(drawn)}", *missing]), dataclasses.asdict(config)
-        write_html(config.output, "The paper's figures", said, command_line(), settings, captions)
+        text = "\n".join([f"drawn: {', '.join(drawn)}", *missing])
+        command = command_line(sys.argv)
+        write_html(config.output, "The paper's figures", text, command, plain_settings(config), captions)
     if missing:
         raise ValueError("; ".join(missing))
 
 
 def name_datasets(config: Config) -> dict[str, str | Path]:
-    """Task to dataset: those of the settings, or datasets/TASK."""
+    """Return the dataset of each task: those of the settings, or datasets/TASK."""
     from dynmap_rl.data.demonstrations import load_meta
 
     if not config.datasets:
@@ -74,36 +77,30 @@ def name_datasets(config: Config) -> dict[str, str | Path]:
     folders = [name.strip() for name in config.datasets.split(",")]
     tasks = [load_meta(folder)["task"] for folder in folders]
     if len(set(tasks)) < len(tasks):
-        raise ValueError(f"--datasets are of the tasks {', '.join(tasks)}; name one of each")
+        raise ValueError(f"--datasets must be one of each task, got datasets of {', '.join(tasks)}")
     return dict(zip(tasks, folders, strict=True))
 
 
 def load_episodes(config: Config, datasets: dict, task: str, split: str = "eval"):
-    """Episodes ``[E, T]`` of a task's dataset, which is recorded where it is not there and none was asked for."""
+    """Load the episodes ``[E, T]`` of a task, which are recorded if no dataset is given and none is there."""
     from dynmap_rl.data.demonstrations import load_dataset
-    from dynmap_rl.data.recording.shards import record_dataset
+    from dynmap_rl.training.dataset import find_or_record
 
     if task not in datasets:
-        raise ValueError(f"it needs a dataset of {task}; name one in --datasets")
-    if not config.datasets:
-        record_dataset(datasets[task], task)
-    return load_dataset(datasets[task], split)
-
-
-def is_done(run: Path) -> bool:
-    return (run / "eval.json").exists()
+        raise ValueError(f"a dataset of {task} is needed; add it to --datasets")
+    return load_dataset(find_or_record(task, datasets[task] if config.datasets else None), split)
 
 
 def how_to_run(config: Config, cells: list[str]) -> str:
-    """The command for the first of the cells."""
-    command = "python recipes/tables.py --results runs/results"
+    """Return the command for the first of the cells."""
+    command = f"python recipes/paper/tables.py --results runs/results --only {cells[0]}"
     others = f" ({len(cells) - 1} more: without --only)" if len(cells) > 1 else ""
-    return f"no finished run {config.runs / cells[0]}; run {command} --only {cells[0]}{others}"
+    return f"{config.runs / cells[0]} must be a finished run; run {command}{others}"
 
 
 def find_missing(config: Config, cells: list[str]) -> list[str]:
-    """Those of the cells that are not done, which is said; ``ValueError`` where that is all of them."""
-    missing = [cell for cell in cells if not is_done(config.runs / cell)]
+    """Return and print the cells without a finished run; ``ValueError`` if none of the cells has one."""
+    missing = [cell for cell in cells if not (config.runs / cell / "eval.json").exists()]
     if len(missing) == len(cells):
         raise ValueError(how_to_run(config, missing))
     if missing:
@@ -112,47 +109,46 @@ def find_missing(config: Config, cells: list[str]) -> list[str]:
 
 
 def draw_distributions(config: Config, datasets: dict) -> None:
+    """Draw the distributions of angles and angular velocities."""
     from dynmap_rl.reporting.figures import plot_distributions
     from dynmap_rl.utils.files import write_json
 
     dynamics = {task: load_episodes(config, datasets, task, "train")["dynamics"] for task in datasets}
     ranges = plot_distributions(dynamics, config.output / "distributions.png")
     names = [str(folder) for folder in datasets.values()]
-    facts = {"command": command_line(), "datasets": names, "ranges": ranges}
+    facts = {"command": command_line(sys.argv), "datasets": names, "ranges": ranges}
     write_json(config.output / "distributions.json", facts)
 
 
 def draw_fig2(config: Config, datasets: dict) -> None:
-    """A demonstration over time."""
+    """Draw a demonstration over time."""
     from dynmap_rl.data.demonstrations import load_meta
-    from dynmap_rl.paper.figures import plot_trajectory
-    from dynmap_rl.paper.figures import widest_ways
+    from dynmap_rl.paper.figures import plot_trajectory, widest_ways
 
     episode = widest_ways(load_episodes(config, datasets, ONE), 1)[0]
     plot_trajectory(episode, load_meta(datasets[ONE])["normalization"], config.output / "fig2.png")
 
 
 def draw_fig3(config: Config, datasets: dict) -> None:
-    """A demonstration of each task."""
-    from dynmap_rl.paper.figures import plot_film_strips
-    from dynmap_rl.paper.figures import widest_ways
+    """Draw a demonstration of each task."""
+    from dynmap_rl.paper.figures import plot_film_strips, widest_ways
 
     strips = {TASKS.get(t, t): widest_ways(load_episodes(config, datasets, t), 1)[0] for t in datasets}
     plot_film_strips(strips, config.output / "fig3.png")
 
 
 def draw_fig4(config: Config, datasets: dict) -> None:
-    """Start states."""
+    """Draw start states."""
     from dynmap_rl.paper.figures import plot_scenes
 
     plot_scenes(load_episodes(config, datasets, ONE)["pixels"][:, 0], config.output / "fig4.png")
 
 
 def draw_prediction(config: Config, datasets: dict, task: str, name: str) -> None:
-    """What the world model of task 1 predicts on a task: Fig. 6 and 9."""
-    from dynmap_rl.reporting.figures import plot_prediction
-    from dynmap_rl.paper.figures import widest_ways
+    """Draw predictions of the world model of task 1 on a task (Fig. 6 and 9)."""
     from dynmap_rl.modules.checkpoints import load_world_model
+    from dynmap_rl.paper.figures import widest_ways
+    from dynmap_rl.reporting.figures import plot_prediction
 
     find_missing(config, [WORLD_MODEL])
     world_model = load_world_model(config.runs / WORLD_MODEL / "world_model")
@@ -162,9 +158,8 @@ def draw_prediction(config: Config, datasets: dict, task: str, name: str) -> Non
 
 
 def draw_fig7(config: Config, datasets: dict) -> None:
-    """Policy losses, held-out ones and those of training."""
-    from dynmap_rl.paper.figures import loss_panels
-    from dynmap_rl.paper.figures import plot_losses
+    """Draw the policies' losses, on held-out demonstrations and in training."""
+    from dynmap_rl.paper.figures import loss_panels, plot_losses
 
     panels = loss_panels(ONE)
     cells = dict.fromkeys(cell for groups in panels.values() for group in groups.values() for cell in group)
@@ -175,10 +170,9 @@ def draw_fig7(config: Config, datasets: dict) -> None:
 
 
 def draw_fig8(config: Config, datasets: dict) -> None:
-    """The paper's 50 test episodes of the first policy seed."""
-    from dynmap_rl.evaluation.protocol import SHARED_STARTS
-    from dynmap_rl.evaluation.rollout import roll_out
-    from dynmap_rl.evaluation.rollout import scene_seeds
+    """Draw position errors of the first policy seed by the paper's protocol."""
+    from dynmap_rl.evaluation.rollout import roll_out, scene_seeds
+    from dynmap_rl.evaluation.settings import SHARED_STARTS
     from dynmap_rl.paper.figures import plot_position_errors
     from dynmap_rl.runs.lookup import load_actor
 
@@ -190,7 +184,7 @@ def draw_fig8(config: Config, datasets: dict) -> None:
     plot_position_errors(panels, config.output / "fig8.png")
 
 
-FIGURES = {  # with their captions
+FIGURES = {  # functions and captions
     "fig2": (draw_fig2, "Fig. 2: a demonstration over time"),
     "fig3": (draw_fig3, "Fig. 3: demonstrations of the tasks"),
     "fig4": (draw_fig4, "Fig. 4: start states"),
@@ -203,4 +197,4 @@ FIGURES = {  # with their captions
 
 
 if __name__ == "__main__":
-    run_recipe(main, Config)
+    run_recipe(main, Config, sys.argv)

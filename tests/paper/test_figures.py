@@ -8,14 +8,16 @@ from matplotlib.colors import to_hex
 from tensordict import TensorDict
 
 from dynmap_rl.data.demonstrations import load_dataset
-from dynmap_rl.evaluation import paper_figures  # MODULE
+from dynmap_rl.paper import figures as paper_figures
+from dynmap_rl.paper.figures import (
+    draw_position_errors,
+    loss_panels,
+    plot_losses,
+    plot_position_errors,
+    read_losses,
+    widest_ways,
+)
 from dynmap_rl.reporting.figures import moving_steps
-from dynmap_rl.paper.figures import draw_position_errors
-from dynmap_rl.paper.figures import loss_panels
-from dynmap_rl.paper.figures import plot_losses
-from dynmap_rl.paper.figures import plot_position_errors
-from dynmap_rl.paper.figures import read_losses
-from dynmap_rl.paper.figures import widest_ways
 from dynmap_rl.runs.folder import append_metrics
 
 RED, BLUE = to_hex("tab:red"), to_hex("tab:blue")

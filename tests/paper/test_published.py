@@ -1,17 +1,9 @@
-"""Our rows beside the paper's, and what a report refuses."""
-
-from pathlib import Path
-from types import SimpleNamespace
+"""The paper's numbers for our rows."""
 
 import pytest
 
 from dynmap_rl.envs.tasks import TASKS
 from dynmap_rl.paper.published import paper_numbers
-from dynmap_rl.evaluation.statistics import shared_interval
-from dynmap_rl.reporting.run_page import write_report
-from dynmap_rl.evaluation.protocol import result_rows
-from dynmap_rl.utils.files import read_json
-from dynmap_rl.utils.files import write_json
 
 
 def row(task, training, policy, name, trained_on="balance_reaching") -> dict:
@@ -71,20 +63,8 @@ def test_the_papers_world_models_are_all_of_task_1(task, training):
         assert paper_numbers(row(task, training, "recurrent", "Only-RGB", trained_on=other)) is None
 
 
-def test_seeds_on_different_world_models_are_no_row(tmp_path, recording):
-    for seed, fingerprint in ((0, "one"), (1, "another")):
-        write_json(tmp_path / f"seed_{seed}" / "eval.json", {"world_model_sha256": fingerprint})
-    with pytest.raises(ValueError, match="belong to another world model"):
-        write_report(tmp_path, SimpleNamespace(), recording, None, None, seeds=[0, 1], frozen="one")
-
-
-def test_intervals_kept_in_the_results_are_those_of_their_episodes():
-    files = [
-        read_json(path) for path in (Path(__file__).parents[2] / "recipes/results").glob("*_recurrent*.json")
-    ]
-    results = [result for result in files if "results" in result]
-    assert len(results) > 50
-    for result in results:
-        for name, outcome in (("SR_interval", "success"), ("DR_interval", "dropped")):
-            kept, found = result["test_protocol"][name], shared_interval(result_rows(result), outcome)
-            assert kept == pytest.approx(found), result["command"]
+def test_a_robot_dataset_has_no_row_in_the_paper():
+    assert (
+        paper_numbers(row(None, "decoupled", "recurrent", "Only-RGB") | {"world_model": {"dataset": "x"}})
+        is None
+    )

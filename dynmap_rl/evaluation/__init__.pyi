@@ -1,0 +1,16 @@
+from .errors import judge_held_out as judge_held_out
+from .errors import policy_errors as policy_errors
+from .errors import prediction_errors as prediction_errors
+from .open_loop import open_loop_errors as open_loop_errors
+from .probing import probe as probe
+from .protocol import evaluate as evaluate
+from .protocol import judge_in_closed_loop as judge_in_closed_loop
+from .rollout import episode_rows as episode_rows
+from .rollout import roll_out as roll_out
+from .rollout import scene_seeds as scene_seeds
+from .settings import Evaluation as Evaluation
+from .statistics import rate_gap as rate_gap
+from .statistics import shared_interval as shared_interval
+from .statistics import summarize as summarize
+from .statistics import summarize_seeds as summarize_seeds
+from .statistics import wilson as wilson

@@ -1,0 +1,14 @@
+from .dataset_page import write_dataset_page as write_dataset_page
+from .figures import plot_dynamics as plot_dynamics
+from .figures import plot_open_loop as plot_open_loop
+from .figures import plot_prediction as plot_prediction
+from .figures import plot_probes as plot_probes
+from .figures import plot_reconstruction as plot_reconstruction
+from .html import write_html as write_html
+from .media import film as film
+from .media import film_policy as film_policy
+from .media import save_gif as save_gif
+from .robot_page import robot_row_text as robot_row_text
+from .robot_page import write_robot_report as write_robot_report
+from .run_page import row_text as row_text
+from .run_page import write_report as write_report

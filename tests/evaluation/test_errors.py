@@ -1,0 +1,58 @@
+"""Errors on held-out episodes, against numbers by hand."""
+
+import pytest
+import torch
+from small import CONSTANTS, load, make_episodes, make_model
+
+from dynmap_rl.data.features import compute_features
+from dynmap_rl.evaluation.errors import judge_held_out, policy_error, policy_errors, prediction_errors
+from dynmap_rl.modules.checkpoints import make_policy
+
+
+@pytest.fixture(scope="module")
+def episodes():
+    return make_episodes()["eval"]
+
+
+def make_small_policy(model):
+    torch.manual_seed(1)
+    return make_policy(CONSTANTS, "recurrent", model, width=8).eval()
+
+
+def test_prediction_errors_are_means_over_steps_with_a_prediction(episodes):
+    model = make_model().eval()
+    with torch.no_grad():
+        states = model.predict(model.encode(episodes["pixels"], mixed=True), episodes["action"])
+        difference = model.decode_dynamics(*states)["position"] - episodes["dynamics", "position"]
+    error = difference[:, 1:].abs().mean((0, 1))
+    found = prediction_errors(model, episodes)
+    assert set(found) == {"error_rgb", "error_position", "error_position_angle"}
+    assert found["error_position"] == pytest.approx(error[[0, 1, 3, 4]].mean().item())
+    assert found["error_position_angle"] == pytest.approx(error[[2, 5]].mean().item())
+    by_entry = prediction_errors(model, episodes, batch=2, by_entry=True)
+    entries = [by_entry[f"error_position_{i}"] for i in range(6)]
+    torch.testing.assert_close(torch.tensor(entries), error, rtol=1e-3, atol=1e-4)
+    assert 0 < found["error_rgb"] < 1
+
+
+def test_policy_errors_leave_disturbed_steps_out_of_the_loss(episodes):
+    model = make_model().eval()
+    policy = make_small_policy(model)
+    features = compute_features(model, episodes)
+    found = policy_errors(policy, features)
+    assert found["imitation_l1"] == pytest.approx(policy_error(model, policy, episodes))
+    with torch.no_grad():
+        predicted = policy(*(features[key] for key in ("latent", "hidden1", "hidden2", "goal")))
+    error = (predicted - features["action"]).abs()
+    assert found["error_action_2"] == pytest.approx(error[..., 2].mean().item())
+    features["disturbed"][:, 0] = True
+    rest = policy_errors(policy, features)["imitation_l1"]
+    assert rest == pytest.approx((error / 0.02)[:, 1:].mul(torch.tensor([1, 1, 0.4])).mean().item(), rel=1e-4)
+
+
+def test_held_out_errors_are_those_of_both_parts(episodes):
+    model = make_model().eval()
+    policy = make_small_policy(model)
+    expected = prediction_errors(model, episodes, by_entry=True)
+    expected |= policy_errors(policy, compute_features(model, episodes))
+    assert judge_held_out(model, policy, load) == {"held_out": expected}

@@ -1,0 +1,20 @@
+"""Rates of experts."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from dynmap_rl.evaluation.experts import fresh_scenes, rates, rates_text
+from dynmap_rl.evaluation.rollout import scene_seeds
+
+
+def test_rates_are_means_over_worlds():
+    worlds = [SimpleNamespace(dropped=i == 0, position_error=0.01 * i, good=i > 1) for i in range(4)]
+    found = rates(SimpleNamespace(is_success=lambda world: world.good), worlds)
+    assert found == {"success": 0.5, "drop": 0.25, "position_error": pytest.approx(0.015), "episodes": 4}
+    assert "50.0 %" in rates_text(found) and "25.0 %" in rates_text(found)
+
+
+def test_scenes_of_checkpoints_are_no_test_scenes():
+    assert len(set(fresh_scenes(50))) == 50
+    assert not set(fresh_scenes(50)) & {*scene_seeds("test", 2000), *scene_seeds("validation", 2000)}

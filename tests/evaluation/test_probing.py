@@ -1,0 +1,23 @@
+"""Linear probes of states whose relation to the dynamics is known."""
+
+import torch
+from small import make_episodes
+
+from dynmap_rl.evaluation import probing
+
+
+def test_r2_of_linear_independent_and_constant_states(monkeypatch):
+    episodes = make_episodes(40, 12)["train"]
+    generator = torch.Generator().manual_seed(0)
+    mix = torch.randn(6, 10, generator=generator)
+
+    def features(_, episodes):
+        position = episodes["dynamics", "position"]
+        noise = torch.randn(*position.shape[:-1], 10, generator=generator)
+        return {"latent": 5 * position @ mix + 3, "hidden1": noise, "hidden2": torch.zeros_like(noise)}
+
+    monkeypatch.setattr(probing, "compute_features", features)
+    r2 = probing.probe(None, episodes[:30], episodes[30:])
+    assert min(r2["latent"]["position"]) > 0.999
+    assert max(r2["hidden1"]["velocity"]) < 0.1
+    assert max(r2["hidden2"]["velocity"]) < 1e-9, "a constant is no better than the mean"
