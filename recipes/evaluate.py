@@ -113,7 +113,7 @@ def load_policy(config: Config, folder: Path, instruction: str):
             "if you trust its author"
         )
     try:
-        from dynmap_rl.integrations.lerobot.actor import LeRobotActor
+        from dynmap_rl.integrations.lerobot import LeRobotActor
     except ImportError as error:
         raise ValueError(
             f"--policy must be a run, got {config.policy}; LeRobot policies need pip install '.[lerobot]' ({error})"

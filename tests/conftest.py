@@ -1,4 +1,4 @@
-"""No network, no display, one thread; and one small recording a task that the tests share."""
+"""Tests without network or display, on one thread, and one small recording for each task, which all tests share."""
 
 import contextlib
 import functools
@@ -11,7 +11,8 @@ from pathlib import Path
 
 os.environ["HF_HUB_OFFLINE"] = "1"
 os.environ["SDL_VIDEODRIVER"] = "dummy"
-os.environ["OMP_NUM_THREADS"] = "1"  # of recipes that a test starts
+os.environ["OMP_NUM_THREADS"] = "1"  # for processes that tests start
+os.environ["TQDM_DISABLE"] = "1"
 
 import pytest
 import torch
@@ -20,13 +21,9 @@ torch.set_num_threads(1)
 ROOT = Path(__file__).parents[1]
 
 
-def pytest_configure(config):
-    config.addinivalue_line("markers", "slow: starts processes of its own; leave out with -m 'not slow'")
-
-
 @pytest.fixture(scope="session")
 def installed(tmp_path_factory):
-    """The folder of the package and of LeRobot's plugin as their wheels hold them: to be named in ``PYTHONPATH``."""
+    """Return a folder with the package and LeRobot's plugin as their wheels install them, for ``PYTHONPATH``."""
     build_wheel = pytest.importorskip("hatchling.build").build_wheel
     wheels, site = tmp_path_factory.mktemp("wheels"), tmp_path_factory.mktemp("site")
     for project in (ROOT, ROOT / "dynmap_rl/integrations/lerobot_policy_dynmap"):
@@ -39,7 +36,7 @@ def installed(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def command(installed):
-    """Run a script with arguments in a folder, on the package as it is installed: its exit code and what it printed."""
+    """Return a function that runs a script in a folder on the installed package; it returns exit code and output."""
     process = subprocess.Popen(
         [sys.executable, "-P", str(ROOT / "tests/worker.py")],
         env=os.environ | {"PYTHONPATH": str(installed)},
@@ -59,23 +56,51 @@ def command(installed):
 
 
 @pytest.fixture(scope="session")
-def recordings(tmp_path_factory):
-    """The folder of a small dataset of a task, 4 + 2 demonstrations in three shards; not to be written to."""
-    from dynmap_rl.data.recording.shards import record_dataset
-    from dynmap_rl.data import recording  # MODULE
+def shared(tmp_path_factory):
+    """Return a folder that all workers of pytest-xdist share."""
+    root = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        root = root.parent
+    (root / "shared").mkdir(exist_ok=True)
+    return root / "shared"
 
-    root = tmp_path_factory.mktemp("datasets")
+
+@pytest.fixture(scope="session")
+def recordings(shared):
+    """Return a function from a task to a small dataset, 4 + 2 demonstrations in three shards, which is read only."""
+    from filelock import FileLock
+
+    from dynmap_rl.data.recording import record as module
 
     @functools.cache
     def record(task: str) -> Path:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(recording, "SHARD_EPISODES", 2)
-            return record_dataset(root / task / "recording", task, episodes=4, eval_episodes=2, workers=1)
+        with pytest.MonkeyPatch.context() as patch, FileLock(shared / f"{task}.lock"):
+            patch.setattr(module, "SHARD_EPISODES", 2)
+            return module.record_dataset(shared / task / "recording", task, "demonstrations", 4, 2, workers=1)
 
     return record
 
 
 @pytest.fixture(scope="session")
 def recording(recordings):
-    """That of task 1."""
+    """Return the dataset of task 1."""
     return recordings("balance_reaching")
+
+
+@pytest.fixture(scope="session")
+def small_run(shared, recordings):
+    """Return a folder, which is read only, with ``datasets/balance_reaching`` and a finished run of ``decoupled``.
+
+    The run lies at its default place, and ``printed.txt`` holds its output.
+    """
+    import commands
+    from filelock import FileLock
+
+    folder = shared / "small_run"
+    with FileLock(shared / "small_run.lock"):
+        if not (folder / "printed.txt").exists():
+            folder.mkdir()
+            commands.place_recordings(folder, recordings, "balance_reaching")
+            result = commands.run_small(folder, "decoupled", pictures=True)
+            (folder / "printed.txt").write_text(result.stdout)
+    return folder

@@ -19,7 +19,9 @@ def name_module(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-MODULES = {name_module(path): path for path in sorted(PACKAGE.rglob("*.py")) if "lerobot_policy" not in str(path)}
+MODULES = {
+    name_module(path): path for path in sorted(PACKAGE.rglob("*.py")) if "lerobot_policy" not in str(path)
+}
 
 
 def list_imports(name: str) -> set[str]:
@@ -76,4 +78,7 @@ def uses_paper(name: str) -> bool:
 
 def test_the_root_holds_no_other_module():
     assert {path.stem for path in PACKAGE.glob("*.py")} == {"__init__", "keys"}
-    assert {path.name for path in PACKAGE.iterdir() if path.is_dir()} - {"__pycache__"} == {*FLOORS, "pretrained"}
+    assert {path.name for path in PACKAGE.iterdir() if path.is_dir()} - {"__pycache__"} == {
+        *FLOORS,
+        "pretrained",
+    }

@@ -1,7 +1,7 @@
-"""Scripts one after another in this process, which would each take long to import torch and LeRobot.
+"""Run scripts one after another in this process, since each alone would take long to import torch and LeRobot.
 
-Says where the package is from. Then, for every line of JSON with a folder, a script and its arguments: runs the script
-in the folder, and answers with its exit code and what it printed.
+Prints where the package lies. Then, for every line of JSON with a folder, a script and its arguments, it runs the
+script in the folder and prints exit code and output as a line of JSON.
 """
 
 import contextlib

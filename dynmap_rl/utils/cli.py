@@ -13,6 +13,7 @@ import os
 import re
 import shlex
 import sys
+import tempfile
 import typing
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -39,15 +40,13 @@ def run_recipe(main: Callable, config_class: type, argv: Sequence[str]) -> None:
         config_class: dataclass of its settings; nested dataclasses become options such as ``--eval.split``.
         argv: ``sys.argv``.
     """
-    import draccus
-
     # Large pages for torch's memory: small ones cost a fifth of a world model's training.
     os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
     sys.path.append(os.getcwd())  # a task named module:Class may lie here
     given = [argument for argument in argv[1:] if argument != "--debug"]
     debug = len(given) < len(argv) - 1
     try:
-        main(draccus.parse(config_class, args=read_arguments(given, config_class), exit_on_error=False))
+        main(parse_settings(config_class, read_arguments(given, config_class)))
     except KeyboardInterrupt:
         sys.exit("stopped; the same command resumes")
     except Exception as error:
@@ -56,6 +55,48 @@ def run_recipe(main: Callable, config_class: type, argv: Sequence[str]) -> None:
             raise
         print(f"error: {message}", file=sys.stderr)
         sys.exit(2)
+
+
+def parse_settings(config_class: type, arguments: Sequence[str]):
+    """Return the dataclass of settings that options, then a file given by ``--config_path``, then defaults set.
+
+    Draccus alone would replace a nested default such as ``PPOTraining(iterations=90)`` by ``PPOTraining()`` as soon as
+    another option of the group is given.
+
+    Raises:
+        ValueError: the file is not a YAML file of settings.
+    """
+    import draccus
+    import mergedeep
+    import yaml
+
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--config_path", type=Path)
+    file, arguments = parser.parse_known_args(arguments)
+    settings = draccus.encode(config_class())
+    if file.config_path:
+        mergedeep.merge(settings, read_settings(file.config_path))
+    with tempfile.NamedTemporaryFile("w", suffix=".yaml") as merged:
+        yaml.safe_dump(settings, merged)
+        merged.flush()
+        return draccus.parse(config_class, merged.name, arguments, exit_on_error=False)
+
+
+def read_settings(path: Path) -> dict:
+    """Read a YAML file of settings.
+
+    Raises:
+        ValueError: the file holds no mapping of names to values.
+    """
+    import yaml
+
+    try:
+        settings = yaml.safe_load(path.read_text())
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path} is not valid YAML ({' '.join(str(error).split())}); correct it") from error
+    if not isinstance(settings, dict):
+        raise ValueError(f"{path} must map names of options to values, got {settings!r}; correct it")
+    return settings
 
 
 def list_options(config_class: type, prefix: str = "--") -> dict[str, type]:
@@ -99,10 +140,10 @@ def _suggest(name: str, options: dict[str, type]) -> str:
 
 def describe_error(error: BaseException) -> str | None:
     """Return what went wrong and what to do, or None for an error that no user has caused."""
-    from draccus.utils import DraccusException
+    from draccus.utils import DecodingError, DraccusException
 
-    while isinstance(error, DraccusException) and error.__cause__ is not None:
-        error = error.__cause__  # raised by the settings themselves
+    while isinstance(error, DraccusException) and not isinstance(error, DecodingError) and error.__cause__:
+        error = error.__cause__  # raised by the settings themselves; a DecodingError names the option
     # Torch raises a RuntimeError where it finds no memory.
     out_of_memory = isinstance(error, RuntimeError) and OUT_OF_MEMORY.search(str(error))
     if isinstance(error, MemoryError) or out_of_memory:

@@ -4,7 +4,7 @@
 
 From the recorded positions, by central differences and by Savitzky-Golay, with and without noise of 2 mm and 0.01 rad
 on them; and from the frames. Needs ``datasets/balance_reaching`` (``python recipes/collect.py``). Writes
-``recipes/results/derivatives.json``.
+``recipes/results/measurements/derivatives.json``.
 """
 
 from __future__ import annotations
@@ -15,13 +15,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dynmap_rl.data.derive import add_dynamics
-from dynmap_rl.data.derive import differentiate
 from dynmap_rl.data.demonstrations import load_dataset
+from dynmap_rl.data.derive import add_dynamics, differentiate
 from dynmap_rl.envs.world import CONTROL_DT
 from dynmap_rl.utils.files import write_json
 
-RESULTS = Path(__file__).parents[2] / "recipes" / "results" / "derivatives.json"
+RESULTS = Path(__file__).parents[2] / "recipes/results/measurements" / "derivatives.json"
 DATASET = "datasets/balance_reaching"
 QUANTITIES = "velocity", "acceleration"
 NOISE = np.array([0.002, 0.002, 0.01] * 2)  # m, m, rad

@@ -8,22 +8,16 @@ from timing import compare, seconds
 from torch import nn
 
 import dynmap_rl  # noqa: F401  (registers the ids)
-from dynmap_rl import data  # MODULE
+from dynmap_rl.data import load_dataset, load_meta, sample_windows
 from dynmap_rl.envs.world import EPISODE_STEPS
-from dynmap_rl.evaluation.rollout import roll_out
-from dynmap_rl.evaluation.rollout import scene_seeds
+from dynmap_rl.evaluation.rollout import roll_out, scene_seeds
 from dynmap_rl.modules.actor import Actor
-from dynmap_rl.modules.world_model import WorldModel
-from dynmap_rl.modules.checkpoints import make_policy
-from dynmap_rl.modules.checkpoints import make_world_model
+from dynmap_rl.modules.checkpoints import make_policy, make_world_model
 from dynmap_rl.modules.precision import mixed_precision
-from dynmap_rl.objectives.world_model import WorldModelLoss
-from dynmap_rl.objectives.world_model import rms
-from dynmap_rl.training.parallel import differentiate
-from dynmap_rl.training.parallel import map_in_threads
-from dynmap_rl.training.parallel import split_batch
-from dynmap_rl.training.loop import descend
-from dynmap_rl.training.loop import make_optimizer
+from dynmap_rl.modules.world_model import WorldModel
+from dynmap_rl.objectives.world_model import WorldModelLoss, rms
+from dynmap_rl.training.loop import descend, make_optimizer
+from dynmap_rl.training.parallel import differentiate, map_in_threads, split_batch
 
 SUPERVISION = ("position", "velocity")
 
@@ -34,9 +28,9 @@ def world_model_training(
     """Frames a second of a training step of ``recipes/decoupled.py``, against the same model in plain float32 with
     LSTM cells in a time loop, which decodes every frame (or as many as the recipe does)."""
     torch.set_num_threads(2)
-    episodes = data.load_dataset(dataset, "train")
-    constants = data.load_meta(dataset)["normalization"]
-    windows = data.sample_windows(episodes, count, steps, torch.Generator().manual_seed(0))
+    episodes = load_dataset(dataset, "train")
+    constants = load_meta(dataset)["normalization"]
+    windows = sample_windows(episodes, count, steps, torch.Generator().manual_seed(0))
     fast = make_world_model(constants, SUPERVISION).to(memory_format=torch.channels_last)
     sizes = split_batch(count, torch.device("cpu"))
     halves = windows.split(sizes)
@@ -122,7 +116,7 @@ def evaluation(dataset: str, episodes: int = 1000, single: int = 5) -> dict:
     """Seconds an episode: 1,000 of them as one batch, against one after the other through the Gymnasium id; both encode
     frames in the precision of training."""
     torch.set_num_threads(1)
-    constants = data.load_meta(dataset)["normalization"]
+    constants = load_meta(dataset)["normalization"]
     world_model = make_world_model(constants, SUPERVISION).eval()
     policy = make_policy(constants, "recurrent", world_model).eval()
 

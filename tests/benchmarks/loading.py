@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from timing import compare, seconds
 
-from dynmap_rl import data  # MODULE
+from dynmap_rl.data import load_dataset, sample_windows
 
 WINDOWS, STEPS = 16, 24
 
@@ -18,7 +18,7 @@ def _lerobot(dataset: str, **arguments):
 
 def window_sampling(dataset: str, batches: int = 5) -> dict:
     """Windows a second, against a ``DataLoader`` with two workers over ``LeRobotDataset`` with delta timestamps."""
-    episodes = data.load_dataset(dataset, "train").select("pixels", "action", "goal", "dynamics")
+    episodes = load_dataset(dataset, "train").select("pixels", "action", "goal", "dynamics")
     generator = torch.Generator().manual_seed(0)
     columns = ["observation.images.front", "action", "dynamics.position", "dynamics.velocity"]
     times = [t / 20 for t in range(STEPS)]
@@ -30,7 +30,7 @@ def window_sampling(dataset: str, batches: int = 5) -> dict:
 
         def run():
             for _ in range(many):  # none is kept, as in training
-                data.sample_windows(episodes, WINDOWS, STEPS, generator)
+                sample_windows(episodes, WINDOWS, STEPS, generator)
 
         return many * WINDOWS / seconds(run)
 
@@ -44,10 +44,10 @@ def window_sampling(dataset: str, batches: int = 5) -> dict:
 
 def to_tensordict(dataset: str, count: int = 3000) -> dict:
     """Frames a second into one TensorDict, against iterating ``LeRobotDataset``."""
-    frames = data.load_dataset(dataset).numel()
+    frames = load_dataset(dataset).numel()
     lerobot = _lerobot(dataset)
 
     def theirs():
         return count / seconds(lambda: [lerobot[i] for i in range(count)])
 
-    return compare(lambda: frames / seconds(lambda: data.load_dataset(dataset)), theirs, repeats=2)
+    return compare(lambda: frames / seconds(lambda: load_dataset(dataset)), theirs, repeats=2)

@@ -1,12 +1,12 @@
-"""The most memory that each recipe needs at a time, with all its processes, in its full size.
+"""Measure the largest memory that each recipe needs, with all its processes, in its full size.
 
     uv run python tests/benchmarks/memory.py              # all recipes
     uv run python tests/benchmarks/memory.py probe play   # some of them
 
-Needs ``datasets/balance_reaching`` (``python recipes/collect.py``), and for ``generalize`` records another.
-Data, batches, models and evaluations are those of a full run; there are only fewer optimiser steps, which need the same
-memory again and again. The cells of ``tables`` are runs of these. Shared pages count once (proportional set size, so Linux only). Writes
-``recipes/results/memory.json``, where recipes that were not asked for stay as they are.
+Needs ``datasets/balance_reaching`` (``python recipes/collect.py``); ``generalize`` records another. Data, batches,
+models and evaluations have their full sizes; there are only fewer optimiser steps, which all need the same memory. The
+cells of ``paper/tables.py`` are runs of these recipes. Shared pages count once (proportional set size, so Linux only).
+Writes ``recipes/results/measurements/memory.json``, where recipes that were not named stay as they are.
 """
 
 from __future__ import annotations
@@ -18,33 +18,33 @@ import tempfile
 import time
 from pathlib import Path
 
-from dynmap_rl.utils.files import read_json
-from dynmap_rl.utils.files import write_json
+from dynmap_rl.utils.files import read_json, write_json
 
 RECIPES = Path(__file__).parents[2] / "recipes"
-RESULTS = RECIPES / "results" / "memory.json"
+RESULTS = RECIPES / "results/measurements/memory.json"
 DATASET = Path("datasets/balance_reaching")
-FEW = ["--updates", "30"]
-POLICY = ["--policy_updates", "30"]
-WORLD_MODEL = ["--world_model", "balance_reaching"]  # the one that ships
+FEW = ["--world_model.updates", "30"]
+TRAINING = ["--training.updates", "30"]
+POLICY = ["--policy.updates", "30"]
+SHIPPED = ["--pretrained", "balance_reaching"]
 COMMANDS = {
     "collect": ["--output", "collected"],
-    "expert": ["--run", "expert", "--iterations", "3"],
+    "expert": ["--run", "expert", "--ppo.iterations", "3"],
     "decoupled": ["--run", "decoupled", *FEW, *POLICY],
-    "generalize": ["--task", "bin_dropping", *WORLD_MODEL, "--run", "generalize", *POLICY],
-    "joint": ["--run", "joint", *FEW],
-    "end_to_end": ["--run", "end_to_end", *FEW],
+    "generalize": ["--task", "bin_dropping", *SHIPPED, "--run", "generalize", *POLICY],
+    "joint": ["--run", "joint", *TRAINING],
+    "end_to_end": ["--run", "end_to_end", *TRAINING],
     "evaluate": [],
-    "latent_ppo": [*WORLD_MODEL, "--run", "latent_ppo", "--iterations", "3"],
+    "latent_ppo": [*SHIPPED, "--run", "latent_ppo", "--ppo.iterations", "3"],
     "probe": ["--runs", "balance_reaching"],
     "add_dynamics": ["--dataset", str(DATASET), "--track", "--replace", "--output", "tracked"],
-    "figures": ["--only", "fig2,fig4"],
+    "paper/figures": ["--only", "fig2,fig4"],
     "play": ["--policy", "balance_reaching", "--steps", "240", "--gif", "film.gif"],
 }
 
 
 def peak(command: list[str], folder: str) -> float:
-    """GB that a command and its children held at most."""
+    """Run a command and return the largest memory (GB) of it and its children."""
     environment = {"SDL_VIDEODRIVER": "dummy"} | os.environ  # a window needs no screen
     process = subprocess.Popen(
         command, cwd=folder, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
@@ -67,10 +67,10 @@ def family(pid: int) -> list[int]:
 
 
 def held(pid: int) -> int:
-    """kB."""
+    """Return the proportional set size (kB) of a process."""
     try:
         lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
-    except OSError:  # it has just ended
+    except OSError:  # the process has just ended
         return 0
     return next((int(line.split()[1]) for line in lines if line.startswith("Pss:")), 0)
 

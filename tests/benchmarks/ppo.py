@@ -17,20 +17,21 @@ import torch
 import dynmap_rl  # noqa: F401  (registers the ids)
 from dynmap_rl.envs.scene import scene_seed
 from dynmap_rl.envs.tasks import get_task
-from dynmap_rl.envs.world import ACCELERATION_LIMIT
-from dynmap_rl.envs.world import EPISODE_STEPS
+from dynmap_rl.envs.world import ACCELERATION_LIMIT, EPISODE_STEPS
 
 GOAL = 0.97
 EXPERT = Path(__file__).parents[2] / "recipes" / "expert.py"
 
 
 def ours(seed: int, iterations: int, num_envs: int, episodes: int, threads: int = 2) -> float:
-    """``recipes/expert.py`` on two threads; it writes its own seconds and success rates, and is stopped at the goal."""
+    """Run ``recipes/expert.py``, which writes its seconds and success rates, and stop it at the goal."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, str(EXPERT), "--run", folder, "--seed", str(seed)]
-        command += ["--threads", str(threads)]
-        command += ["--iterations", str(iterations), "--num_envs", str(num_envs), "--checkpoint_every", "1"]
-        command += ["--eval_episodes", str(episodes), "--final_episodes", str(episodes)]
+        sizes = {
+            "ppo.seed": seed, "threads": threads, "ppo.iterations": iterations, "ppo.num_envs": num_envs,
+            "ppo.checkpoint_every": 1, "ppo.eval_episodes": episodes, "ppo.final_episodes": episodes,
+        }  # fmt: skip
+        command = [sys.executable, str(EXPERT), "--run", folder]
+        command += [f"--{name}={size}" for name, size in sizes.items()]
         with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
             reached = math.inf
             while math.isinf(reached) and process.poll() is None:
@@ -48,7 +49,7 @@ def _reached(folder: str) -> float:
 
 
 def stable_baselines(seed: int, iterations: int, num_envs: int, episodes: int, threads: int = 2) -> float:
-    """Stable-Baselines3's PPO on the Gymnasium id, with the same settings, on two threads too, as it comes."""
+    """Run Stable-Baselines3's PPO on the Gymnasium id, with the same settings and threads."""
     from stable_baselines3 import PPO
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.env_util import make_vec_env
@@ -57,7 +58,7 @@ def stable_baselines(seed: int, iterations: int, num_envs: int, episodes: int, t
     task = get_task("balance_reaching")
 
     class Watch(BaseCallback):
-        """Stops at the goal; ``spent`` is the time without evaluations."""
+        """Callback that stops at the goal; ``spent`` is the time without evaluations."""
 
         spent = 0.0
         reached = math.inf
@@ -109,7 +110,7 @@ def stable_baselines(seed: int, iterations: int, num_envs: int, episodes: int, t
 
 
 def ppo(seeds=(0, 1, 2), iterations: int = 45, num_envs: int = 64, episodes: int = 200) -> dict:
-    """Seconds to the goal, the median over seeds; infinite where 345,600 frames were not enough."""
+    """Return the seconds to the goal, the median over seeds; infinite where the frames were not enough."""
     sizes = iterations, num_envs, episodes
     pairs = [(ours(seed, *sizes), stable_baselines(seed, *sizes)) for seed in seeds]
     a, b = (float(np.median(times)) for times in zip(*pairs, strict=True))

@@ -1,10 +1,11 @@
-"""The speed table of the README: every row times two things in one run and gives their ratio.
+"""Time pairs of things in one run and write the tables of tests/benchmarks/README.md.
 
     uv run --extra benchmarks python tests/benchmarks/run.py            # all rows
     uv run --extra benchmarks python tests/benchmarks/run.py batch ppo  # some of them
+    uv run --extra benchmarks python tests/benchmarks/run.py --write    # only the page, from the stored numbers
 
-Needs ``datasets/balance_reaching`` (``python recipes/collect.py``). Writes ``recipes/results/benchmarks.json``, where
-rows that were not asked for stay as they are. The last rows of the table are ``recipes/results/main_job_time.json``.
+Needs ``datasets/balance_reaching`` (``python recipes/collect.py``). Writes
+``recipes/results/measurements/benchmarks.json``, where rows that were not named stay as they are, and the page.
 """
 
 from __future__ import annotations
@@ -16,18 +17,20 @@ import sys
 from datetime import date
 from pathlib import Path
 
-os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")  # as recipes do; before torch is there
+os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")  # as recipes do; before torch is imported
 import learning
 import loading
 import ppo
 import simulation
 import starting
 
-from dynmap_rl.utils.files import read_json
-from dynmap_rl.utils.files import write_json
+from dynmap_rl.utils.files import read_json, write_bytes, write_json
 
-RESULTS = Path(__file__).parents[2] / "recipes" / "results" / "benchmarks.json"
+RESULTS = Path(__file__).parents[2] / "recipes/results/measurements" / "benchmarks.json"
 MAIN_JOBS = RESULTS.with_name("main_job_time.json")
+MEMORY, SOAK = RESULTS.with_name("memory.json"), RESULTS.with_name("soak.json")
+PAGE = Path(__file__).with_name("README.md")
+START, END = "<!-- written by tests/benchmarks/run.py --write -->", "<!-- end -->"
 DATASET = "datasets/balance_reaching"
 US, MS = 1e6, 1e3
 
@@ -39,10 +42,6 @@ ROWS = {
     "frame": ("control step with 64x64 frame", "the same without", "us", US, "<= 1.25", simulation.frame),
     "pusht": ("frames/s with pixels", "gym-pusht `pixels`", "1/s", 1, ">= 10", simulation.pusht),
     "batch": ("batched environment, a step of 64 worlds", "the worlds alone", "ms", MS, "<= 1.1", simulation.batch),
-    "batch_threads": (
-        "the same, its worlds on two threads", "the worlds alone, on one", "ms", MS, "",
-        lambda **sizes: simulation.batch(**sizes, threads=2),
-    ),
     "processes": ("two processes of 64 worlds", "one", "steps/s", 1, ">= 1.8", simulation.processes),
     "ppo": ("PPO, time to 97 % success", "Stable-Baselines3 on our Gymnasium id", "s", 1, "<= 0.33", ppo.ppo),
     "training": (
@@ -70,21 +69,52 @@ ROWS = {
 }  # fmt: skip
 
 
-def markdown(results: dict, main_jobs: dict) -> str:
-    """The table: its rows, and the main job's, which was timed apart on each machine and has nothing to be compared with."""
-    lines = ["| what | against | ours | theirs | ratio | to reach |", "|---|---|---|---|---|---|"]
+def speed_table(results: dict) -> str:
+    """Return the rows that have been timed as a table."""
+    lines = ["| what | against | ours | theirs | ratio | goal |", "|---|---|---|---|---|---|"]
     for name, (what, against, unit, factor, goal, _) in ROWS.items():
         if row := results["rows"].get(name):
             ours, theirs = (f"{row[key] * factor:.3g} {unit}" for key in ("ours", "theirs"))
             lines.append(f"| {what} | {against} | {ours} | {theirs} | **{row['ratio']:.2f}** | {goal} |")
+    return "\n".join(lines)
+
+
+def main_job_table(main_jobs: dict) -> str:
+    """Return the times of the main job, which was timed once on each machine."""
+    lines = ["| `recipes/decoupled.py` from a fresh clone | minutes | SR | PE |", "|---|---|---|---|"]
     for run in main_jobs["runs"]:
-        found = f"{run['real_seconds'] / 60:.1f} min"
+        found = " | "
         if "SR" in run:
             low, high = run["SR_interval"]
-            found += f", SR {run['SR']:.1f} % [{low:.1f}, {high:.1f}], PE {run['PE']:.1f} mm"
-        what = f"main job from a fresh clone, `{run['command']}`, {run['processor']}"
-        lines.append(f"| {what} |  | {found} |  |  | <= 12 min |")
+            found = f"{run['SR']:.1f} % [{low:.1f}, {high:.1f}] | {run['PE']:.1f} mm"
+        lines.append(f"| {run['processor']} | {run['real_seconds'] / 60:.1f} | {found} |")
     return "\n".join(lines)
+
+
+def memory_table(memory: dict) -> str:
+    """Return the largest memory of every recipe, all its processes together."""
+    lines = [f"| recipe | {memory['unit']} |", "|---|---|"]
+    return "\n".join(lines + [f"| `{name}` | {peak:.1f} |" for name, peak in memory["peak"].items()])
+
+
+def soak_text(soak: dict) -> str:
+    """Return the held memory at the beginning and the end of the soak test."""
+    first, last = soak["held_mb"][0], soak["held_mb"][-1]
+    steps, episodes = f"{soak['steps']:,} control steps with frames", f"{soak['episodes']:,} episodes"
+    return f"Held memory over {steps} ({episodes}): {first} MB after the first tenth, {last} MB at the end."
+
+
+def page(text: str) -> str:
+    """Return the text of the page with its tables written anew from the stored measurements."""
+    tables = (
+        speed_table(read_json(RESULTS)),
+        main_job_table(read_json(MAIN_JOBS)),
+        memory_table(read_json(MEMORY)),
+        soak_text(read_json(SOAK)),
+    )
+    before, _, rest = text.partition(START)
+    _, _, after = rest.partition(END)
+    return before + "\n\n".join([START, *tables, END]) + after
 
 
 def commit() -> str:
@@ -94,6 +124,9 @@ def commit() -> str:
 
 
 def main(names: list[str]) -> None:
+    """Time the rows and write the page; ``--write`` in the place of names writes the page alone."""
+    if names == ["--write"]:
+        return write_bytes(PAGE, page(PAGE.read_text()).encode())
     if unknown := set(names) - set(ROWS):
         sys.exit(f"unknown rows {sorted(unknown)}; choose from {list(ROWS)}")
     results = read_json(RESULTS) if RESULTS.exists() else {"rows": {}}
@@ -103,7 +136,8 @@ def main(names: list[str]) -> None:
             results["rows"][name] = row | {"date": f"{date.today()}", "commit": commit()}
             results["machine"] = platform.platform()
             write_json(RESULTS, results)
-    print(markdown(results, read_json(MAIN_JOBS)))
+    write_bytes(PAGE, page(PAGE.read_text()).encode())
+    print(speed_table(results))
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""Cost against size, for 1, 10 and 100 times as many demonstrations, worlds and evaluated episodes.
+"""Measure cost against size, for 1, 10 and 100 times as many demonstrations, worlds and evaluated episodes.
 
     uv run python tests/benchmarks/scaling.py
 
-Writes ``recipes/results/scaling.json`` and ``scaling.png``, where a straight line of slope one is linear cost.
+Writes ``recipes/results/measurements/scaling.json`` and ``recipes/results/media/scaling.png``, where a straight line of slope one is linear cost.
 """
 
 from __future__ import annotations
@@ -14,24 +14,22 @@ import matplotlib
 import torch
 from timing import seconds
 
-from dynmap_rl import data  # MODULE
+from dynmap_rl.data import load_dataset, load_meta, record_dataset
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
-from dynmap_rl.evaluation.rollout import roll_out
-from dynmap_rl.evaluation.rollout import scene_seeds
+from dynmap_rl.evaluation.rollout import roll_out, scene_seeds
 from dynmap_rl.modules.actor import Actor
-from dynmap_rl.modules.checkpoints import make_policy
-from dynmap_rl.modules.checkpoints import make_world_model
+from dynmap_rl.modules.checkpoints import make_policy, make_world_model
 from dynmap_rl.utils.files import write_json
 
-RESULTS = Path(__file__).parents[2] / "recipes" / "results"
+RESULTS = Path(__file__).parents[2] / "recipes/results/measurements"
 FACTORS = 1, 10, 100
 
 
 def demonstrations(count: int, folder: Path) -> tuple[float, float]:
     """Seconds to record ``count`` episodes, and to load them."""
     folder = folder / str(count)
-    record = seconds(lambda: data.record_dataset(folder, episodes=count, eval_episodes=1, workers=1))
-    return record, seconds(lambda: data.load_dataset(folder))
+    record = seconds(lambda: record_dataset(folder, episodes=count, eval_episodes=1, workers=1))
+    return record, seconds(lambda: load_dataset(folder))
 
 
 def worlds(count: int, steps: int = 20) -> float:
@@ -53,10 +51,10 @@ def measure() -> dict[str, list[list[float]]]:
     torch.set_num_threads(1)
     found = {}
     with tempfile.TemporaryDirectory() as folder:
-        demonstrations(1, Path(folder))  # imports are no cost of size
+        demonstrations(1, Path(folder))  # imports do not depend on the size
         sizes = [4 * factor for factor in FACTORS]
         times = [demonstrations(size, Path(folder)) for size in sizes]
-        constants = data.load_meta(Path(folder) / str(sizes[-1]))["normalization"]
+        constants = load_meta(Path(folder) / str(sizes[-1]))["normalization"]
     for name, column in zip(("demonstrations recorded", "demonstrations loaded"), (0, 1), strict=True):
         found[name] = [[size, time[column]] for size, time in zip(sizes, times, strict=True)]
     found["worlds, a control step"] = [[n, worlds(n)] for n in (16 * factor for factor in FACTORS)]
@@ -83,7 +81,7 @@ def main() -> None:
     for name, pairs in found.items():
         print(name, ", ".join(f"{size}: {time:.3g} s" for size, time in pairs))
     write_json(RESULTS / "scaling.json", found)
-    draw(found, RESULTS / "scaling.png")
+    draw(found, RESULTS.with_name("media") / "scaling.png")
 
 
 if __name__ == "__main__":

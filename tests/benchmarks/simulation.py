@@ -14,14 +14,11 @@ from timing import compare, seconds
 from torchrl.envs.utils import step_mdp
 
 import dynmap_rl  # noqa: F401  (registers the ids)
-from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
-from dynmap_rl.envs.world import World
-from dynmap_rl.envs.scene import sample_scene
 from dynmap_rl.envs.renderer import Renderer
+from dynmap_rl.envs.scene import sample_scene
 from dynmap_rl.envs.tasks import get_task
-from dynmap_rl.envs.world import CONTROL_DT
-from dynmap_rl.envs.world import EPISODE_STEPS
-from dynmap_rl.envs.world import SUBSTEPS
+from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
+from dynmap_rl.envs.world import CONTROL_DT, EPISODE_STEPS, SUBSTEPS, World
 
 TASK = get_task("balance_reaching")
 
@@ -103,13 +100,13 @@ def pusht() -> dict | None:
     return compare(ours, theirs, repeats=5)
 
 
-def batch(num_envs: int = 64, steps: int = 60, threads: int = 1) -> dict:
+def batch(num_envs: int = 64, steps: int = 60) -> dict:
     """The batched TorchRL environment against its worlds alone, on one core, a control step of all of them."""
     torch.set_num_threads(1)
     actions = np.stack([smooth_actions(i, steps) for i in range(num_envs)], 1).astype(np.float32)
 
     def ours():
-        env = DynmapBatchedEnv(num_envs=num_envs, seed=0, threads=threads)
+        env = DynmapBatchedEnv(num_envs=num_envs, seed=0)
         td, tensors = env.reset(scene_seed=torch.arange(num_envs)), torch.from_numpy(actions)
 
         def run():

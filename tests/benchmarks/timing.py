@@ -1,4 +1,4 @@
-"""Two things timed in turn, in one run: the machine's mood is then in both."""
+"""Comparison of two functions timed in turn, so that the load of the machine affects both."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ from collections.abc import Callable
 
 
 def compare(ours: Callable[[], float], theirs: Callable[[], float], repeats: int = 9) -> dict[str, float]:
-    """Medians of what two functions return, and the median of ours / theirs over the pairs.
+    """Return the medians of two functions' numbers, and the median of ours / theirs over the pairs.
 
     Args:
-        ours, theirs: each does its work and returns a number, seconds or a rate.
+        ours: function that does its work and returns a number, seconds or a rate.
+        theirs: the same for what it is compared with.
+        repeats: number of pairs.
     """
     ours(), theirs()  # warm
     pairs = [(ours(), theirs()) for _ in range(repeats)]

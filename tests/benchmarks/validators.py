@@ -3,7 +3,7 @@
     python tests/benchmarks/validators.py --bin robovet/bin --bin rdq/bin --bin lerobot-doctor/bin
 
 Each is installed by ``pip install robovet``, ``rdq`` and ``lerobot-doctor``, in an environment of its own, whose ``bin``
-folders are named; on datasets/TASK of the three tasks. Writes ``recipes/results/validators.json``.
+folders are named; on datasets/TASK of the three tasks. Writes ``recipes/results/measurements/validators.json``.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 from dynmap_rl.envs.tasks import TASKS
 from dynmap_rl.utils.files import write_json
 
-RESULTS = Path(__file__).parents[2] / "recipes" / "results"
+RESULTS = Path(__file__).parents[2] / "recipes/results/measurements"
 COMMANDS = {
     "robovet": ["doctor", "DATASET"],
     "rdq": ["check", "DATASET", "--fail-under", "100"],

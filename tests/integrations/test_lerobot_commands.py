@@ -1,5 +1,7 @@
-"""LeRobot's own commands, as its users type them, on the installed wheels, by whose plugin LeRobot finds us. One starts
-as a process of its own, the others in one that they share, for LeRobot takes long to import."""
+"""LeRobot's commands on the installed wheels, whose plugin LeRobot finds.
+
+One command runs as a process of its own; the others share a process, since importing LeRobot takes long.
+"""
 
 import json
 import os
@@ -12,9 +14,12 @@ import torch
 from safetensors.torch import load_file
 
 from dynmap_rl.data.demonstrations import load_dataset
+from dynmap_rl.keys import GYMNASIUM_IDS
+
+pytestmark = pytest.mark.slow
 
 PLUGIN = "discover_packages_path=dynmap_rl.integrations.lerobot"
-TASKS = ("balance_reaching", "balance_reaching_obstacle", "bin_dropping")
+TASKS = tuple(GYMNASIUM_IDS)
 QUICK = ["--batch_size=2", "--log_freq=1", "--num_workers=0", "--env_eval_freq=0"]
 SMALL = {
     "dynmap": ["--policy.window_steps=6", "--policy.rgb_steps=2"],
@@ -40,7 +45,7 @@ SMALL = {
 
 @pytest.fixture
 def lerobot(command, tmp_path):
-    """Run ``lerobot-NAME``: what it printed."""
+    """Return a function that runs ``lerobot-NAME`` and returns its output."""
 
     def run(name, *arguments, code=0):
         done = command(tmp_path, Path(sys.executable).with_name(f"lerobot-{name}"), *arguments)
@@ -83,8 +88,7 @@ def evaluate(lerobot, path, task, output):
 
 @pytest.fixture(scope="module")
 def trained(recording, installed, tmp_path_factory):
-    """Four steps of ``lerobot-train`` in a process of its own, with checkpoints after two and four and an evaluation at the
-    end: its folder, and what it printed."""
+    """Return folder and output of four steps of ``lerobot-train``, with two checkpoints and an evaluation at the end."""
     output = tmp_path_factory.mktemp("lerobot") / "train"
     command = [Path(sys.executable).with_name("lerobot-train"), "--save_freq=2"]
     command += [*train_arguments("dynmap", recording, output, 4), "--env.type=dynmap"]
@@ -103,7 +107,7 @@ def test_train_supervises_on_the_dynamics(trained):
     output, printed = trained
     for term in ("rgb", "latent", "position", "velocity", "policy"):
         assert f"loss_{term}:" in printed
-    assert "pc_success" in printed, "it was evaluated"
+    assert "pc_success" in printed
     names = {path.name for path in (output / "checkpoints/last/pretrained_model").iterdir()}
     assert {"config.json", "model.safetensors", "policy_preprocessor.json"} <= names
 
@@ -122,7 +126,7 @@ def test_resuming_gives_the_weights_of_the_uninterrupted_run(trained, lerobot):
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_eval_plays_the_policy(trained, lerobot, tmp_path, task):
+def test_eval_runs_the_policy(trained, lerobot, tmp_path, task):
     info = evaluate(lerobot, trained[0] / "checkpoints/last/pretrained_model", task, tmp_path / "eval")
     assert info["overall"]["n_episodes"] == 1
     assert info["overall"]["pc_success"] == 0.0
@@ -131,7 +135,7 @@ def test_eval_plays_the_policy(trained, lerobot, tmp_path, task):
 
 
 @pytest.mark.parametrize("kind", ["act", "diffusion"])
-def test_policies_of_lerobot_train_on_our_data_and_play_our_tasks(kind, recording, lerobot, tmp_path):
+def test_policies_of_lerobot_train_on_the_datasets_and_act_in_the_tasks(kind, recording, lerobot, tmp_path):
     output = tmp_path / "train"
     lerobot("train", *train_arguments(kind, recording, output, 1))
     for task in TASKS:
@@ -146,7 +150,7 @@ def test_edited_datasets_stay_datasets_that_can_be_trained_on(recording, lerobot
     lerobot("edit-dataset", *common, f"--new_root={edited}", *operation)
     kept = load_dataset(recording)[[1, 2, 4, 5]]
     after = load_dataset(edited)
-    for key in ("pixels", "agent_pos", "action", "dynamics"):
+    for key in ("pixels", "agent_pos", "action", "dynamics", "disturbed"):
         assert (after[key] == kept[key]).all()
     lerobot("train", *train_arguments("dynmap", edited, tmp_path / "train", 1))
 
@@ -154,7 +158,7 @@ def test_edited_datasets_stay_datasets_that_can_be_trained_on(recording, lerobot
     operation = ["--operation.type=remove_feature", "--operation.feature_names=['dynamics.velocity']"]
     lerobot("edit-dataset", *common, f"--new_root={bare}", *operation)
     printed = lerobot("train", *train_arguments("dynmap", bare, tmp_path / "bare_train", 1), code=1)
-    assert "lacks the columns dynamics.velocity" in printed
+    assert "must have the columns dynamics.velocity" in printed
 
 
 def test_viewer_takes_an_episode(recording, lerobot, tmp_path):

@@ -1,29 +1,37 @@
-"""Run folders that become LeRobot's and ours again."""
+"""Conversion of run folders to LeRobot checkpoints and back."""
 
 import pytest
 import torch
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_policy, make_policy_config, make_pre_post_processors
+from tensordict import TensorDict
 
-from dynmap_rl import modules  # MODULE
-from dynmap_rl.runs.lookup import load_source
+from dynmap_rl.integrations.lerobot.actor import LeRobotActor
 from dynmap_rl.integrations.lerobot.configuration_dynmap import DynmapConfig
 from dynmap_rl.integrations.lerobot.environment import DynmapEnvConfig
-from dynmap_rl.integrations.lerobot.export import export_to_lerobot
-from dynmap_rl.integrations.lerobot.export import import_from_lerobot
+from dynmap_rl.integrations.lerobot.export import export_to_lerobot, import_from_lerobot
 from dynmap_rl.integrations.lerobot.modeling_dynmap import DynmapPolicy
-from dynmap_rl.utils.files import read_json
-from dynmap_rl.utils.files import write_json
+from dynmap_rl.modules.actor import Actor
+from dynmap_rl.modules.checkpoints import (
+    load_policy,
+    load_world_model,
+    make_world_model,
+    save_policy,
+    save_world_model,
+)
+from dynmap_rl.modules.checkpoints import make_policy as make_own_policy
+from dynmap_rl.runs.lookup import load_source, task_of_run
+from dynmap_rl.utils.files import read_json, write_json
 from dynmap_rl.utils.weights import fingerprint
 
 
 def make_run(folder, kind, keypoints=False, goal=2):
     sizes = {"action": 3, "goal": goal, "position": 6}
     meta = {name: {"low": [-1.0] * n, "high": [2.0] * n} for name, n in sizes.items()}
-    world_model = modules.make_world_model(meta, ("position",), 16, 24, keypoints)
-    policy = modules.make_policy(meta, kind, world_model, width=20)
-    modules.save_world_model(folder / "world_model", world_model)
-    modules.save_policy(folder / "seed_1" / "policy", policy, world_model)
+    world_model = make_world_model(meta, ("position",), 16, 24, keypoints)
+    policy = make_own_policy(meta, kind, world_model, width=20)
+    save_world_model(folder / "world_model", world_model)
+    save_policy(folder / "seed_1" / "policy", policy, world_model)
     return world_model, policy
 
 
@@ -36,51 +44,53 @@ def test_a_run_exports_to_lerobot_and_back(tmp_path, kind, keypoints):
     assert type(theirs) is DynmapPolicy
     preprocessor, postprocessor = make_pre_post_processors(theirs.config, pretrained_path=str(exported))
     import_from_lerobot(exported, back, seed=1)
-    ours = modules.load_world_model(back / "world_model"), modules.load_policy(back / "seed_1" / "policy")
+    ours = load_world_model(back / "world_model"), load_policy(back / "seed_1" / "policy")
     for before, after in zip((world_model, policy), ours, strict=True):
         assert fingerprint(before) == fingerprint(after)
 
     frames = torch.randint(0, 256, (4, 2, 3, 64, 64), dtype=torch.uint8)
     states = torch.rand(4, 2, 5)
     again = DynmapPolicy.from_pretrained(export_to_lerobot(back, tmp_path / "again", seed=1))
-    state, policy_state = world_model.initial_state(2), policy.initial_state(2)
+    through_lerobot = LeRobotActor(exported)
+    actor, memory = Actor(world_model, policy, mixed=True), TensorDict({}, [2])
     for pixels, agent_pos in zip(frames, states, strict=True):
         batch = {"observation.images.front": pixels / 255, "observation.state": agent_pos}
         action = postprocessor(theirs.select_action(preprocessor(batch)))
         assert torch.equal(action, again.select_action(batch))
+        td = TensorDict({"pixels": pixels, "agent_pos": agent_pos, "goal": agent_pos[:, -2:]}, [2])
+        assert torch.equal(action, through_lerobot(td)["action"])
         with torch.no_grad():
-            latent = world_model.encode(pixels, mixed=True)
-            expected, policy_state = policy.step(latent, state[0], state[2], agent_pos[:, -2:], policy_state)
-            state = world_model.step(latent, expected, state)[1]
-        assert torch.equal(action, expected)
+            td = actor(td.update(memory))
+        assert torch.equal(action, td["action"])
+        memory = td["next"]
 
 
-def test_a_run_that_went_to_lerobot_and_back_knows_its_task_and_its_source(tmp_path):
+def test_task_and_source_of_a_run_are_kept(tmp_path):
     run, source = tmp_path / "run", {"task": "balance_reaching", "training": "joint"}
     world_model, _ = make_run(run, "recurrent")
     write_json(run / "config.json", {"task": "bin_dropping", "seeds": "0,1,2"})
     write_json(run / "eval.json", {"world_model": source, "results": [{}]})
     exported = export_to_lerobot(run, tmp_path / "exported", seed=1)
     back = import_from_lerobot(exported, tmp_path / "back", seed=1)
-    assert modules.task_of_run(back) == modules.task_of_run(exported) == "bin_dropping"
+    assert task_of_run(back) == task_of_run(exported) == "bin_dropping"
     model, found = load_source(back)
     assert (fingerprint(model), found) == (fingerprint(world_model), source)
     assert read_json(back / "eval.json") == {"world_model": source, "imported_from": str(exported)}
-    with pytest.raises(ValueError, match="holds another run"):
+    with pytest.raises(ValueError, match="another"):
         import_from_lerobot(exported, run, seed=1)
 
     (run / "eval.json").unlink()  # not done yet
     unfinished = export_to_lerobot(run, tmp_path / "unfinished", seed=1)
-    with pytest.raises(ValueError, match="holds no finished run"):
+    with pytest.raises(ValueError, match="again"):
         load_source(import_from_lerobot(unfinished, tmp_path / "again", seed=1))
 
 
-def test_a_policy_of_lerobot_train_knows_the_task_of_its_dataset(recording, tmp_path):
+def test_a_policy_of_lerobot_train_has_the_task_of_its_dataset(recording, tmp_path):
     dataset = LeRobotDataset("user/small", root=recording, video_backend="pyav")
     config = make_policy_config("dynmap", device="cpu", push_to_hub=False)
     make_policy(config, ds_meta=dataset.meta).save_pretrained(tmp_path / "pretrained_model")
     run = import_from_lerobot(tmp_path / "pretrained_model", tmp_path / "run")
-    assert modules.task_of_run(run) == "balance_reaching"
+    assert task_of_run(run) == "balance_reaching"
     assert load_source(run)[1] == {"task": "balance_reaching", "training": "joint"}
 
 
@@ -90,14 +100,14 @@ def config_of(folder):
     return config
 
 
-def test_export_and_import_say_what_is_missing(tmp_path):
-    with pytest.raises(ValueError, match="train one first"):
+def test_export_and_import_name_the_folder_that_does_not_fit(tmp_path):
+    with pytest.raises(ValueError, match="arguments.json"):
         export_to_lerobot(tmp_path, tmp_path / "out")
     make_run(tmp_path / "other", "recurrent", goal=4)
-    with pytest.raises(ValueError, match="another scene"):
+    with pytest.raises(ValueError, match="goal"):
         export_to_lerobot(tmp_path / "other", tmp_path / "out", seed=1)
     with pytest.raises(ValueError, match=r"no config\.json"):
         import_from_lerobot(tmp_path, tmp_path / "run")
     make_policy_config("act", push_to_hub=False, device="cpu").save_pretrained(tmp_path)
-    with pytest.raises(ValueError, match="the type act"):
+    with pytest.raises(ValueError, match="act"):
         import_from_lerobot(tmp_path, tmp_path / "run")

@@ -1,35 +1,42 @@
+"""Actor and latent actor: step form against sequence form, memory, imagination."""
+
 import pytest
 import torch
+from small import CONSTANTS, make_model
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, InitTracker, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
+from dynmap_rl.envs.imagination import ImaginationEnv, make_start
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
-from dynmap_rl.evaluation.rollout import roll_out
-from dynmap_rl.modules.actor import Actor
+from dynmap_rl.modules.actor import MEMORY, POLICY_MEMORY, Actor, LatentActor
 from dynmap_rl.modules.checkpoints import make_policy
-from dynmap_rl.modules.checkpoints import make_world_model
 
-CONSTANTS = {
-    "action": {"low": [-0.02, -0.02, -0.05], "high": [0.02, 0.02, 0.05]},
-    "goal": {"low": [0.0, 0.0], "high": [1.0, 1.0]},
-    "position": {"low": [0.0] * 6, "high": [1.0] * 6},
-}
+both_kinds = pytest.mark.parametrize("kind", ["feedforward", "recurrent"])
 
 
 def make_actor(kind="recurrent"):
-    torch.manual_seed(0)
-    model = make_world_model(CONSTANTS, ("position",), latent_size=16, hidden_size=24)
+    model = make_model()
     return Actor(model, make_policy(CONSTANTS, kind, model, width=20)).eval()
 
 
-def make_env(actor, num_envs=2):
-    env = DynmapBatchedEnv(num_envs=num_envs, from_pixels=True, seed=0)
+def make_env(actor):
+    env = DynmapBatchedEnv(num_envs=2, from_pixels=True, seed=0)
     return TransformedEnv(env, Compose(InitTracker(), actor.make_tensordict_primer()))
 
 
-@pytest.mark.parametrize("kind", ["feedforward", "recurrent"])
+def make_frames(b=2, t=4):
+    generator = torch.Generator().manual_seed(0)
+    data = {
+        "pixels": torch.randint(0, 256, (b, t, 3, 64, 64), dtype=torch.uint8, generator=generator),
+        "action": 0.01 * torch.randn(b, t, 3, generator=generator),
+        "goal": torch.rand(b, 1, 2, generator=generator).expand(b, t, 2),
+    }
+    return TensorDict(data, [b, t])
+
+
+@both_kinds
 @torch.no_grad()
 def test_rollout_equals_the_sequence_form(kind):
     actor = make_actor(kind)
@@ -38,28 +45,90 @@ def test_rollout_equals_the_sequence_form(kind):
     out = env.rollout(10, actor)
     model = actor.world_model
     latent = model.encode(out["pixels"])
-    _, hidden1, hidden2 = model.predict(latent, out["action"])
+    predicted, hidden1, hidden2 = model.predict(latent, out["action"])
     torch.testing.assert_close(out["hidden1"], hidden1, rtol=1e-4, atol=1e-5)
+    after = out["next", "predicted_latent"][:, :-1]
+    torch.testing.assert_close(after, predicted[:, 1:], rtol=1e-4, atol=1e-5)
     actions = actor.policy(latent, hidden1, hidden2, out["goal"])
     torch.testing.assert_close(out["action"], actions, rtol=1e-3, atol=1e-5)
+
+
+@both_kinds
+@torch.no_grad()
+def test_observe_act_and_predict_compose_to_a_call(kind):
+    actor, frames = make_actor(kind), make_frames()
+    memory = TensorDict({}, [2])
+    for t in range(4):
+        seen = frames[:, t].select("pixels", "goal").update(memory)
+        whole, parts = actor(seen.clone()), seen.clone()
+        assert "action" not in actor.observe(parts)
+        assert ("next", "hidden1") not in actor.act(parts).keys(True)
+        actor.predict(parts)
+        assert set(parts.keys(True, True)) == set(whole.keys(True, True))
+        assert set(actor.out_keys) <= set(parts.keys(True, True))
+        for key in parts.keys(True, True):
+            assert torch.equal(parts[key], whole[key]), key
+        memory = parts["next"]
+
+
+@torch.no_grad()
+def test_predict_takes_the_action_that_was_executed():
+    actor, frames = make_actor(), make_frames()
+    td = actor.act(actor.observe(frames[:, 0].select("pixels", "goal")))
+    executed = actor.predict(td.clone().set("action", frames["action"][:, 0]))["next"]
+    state = actor.world_model.initial_state(2)
+    expected, state = actor.world_model.step(td["latent"], frames["action"][:, 0], state)
+    assert torch.equal(executed["predicted_latent"], expected)
+    for key, value in zip(MEMORY, state, strict=True):
+        assert torch.equal(executed[key], value)
+    for key in POLICY_MEMORY:
+        assert torch.equal(executed[key], td["next", key])
+
+
+@both_kinds
+@torch.no_grad()
+def test_without_frames_the_actor_imagines_as_the_imagination_environment(kind):
+    actor, frames = make_actor(kind), make_frames()
+    start = make_start(actor.world_model, frames)
+    latent_actor = LatentActor(actor.policy)
+    env = ImaginationEnv(actor.world_model, start)
+    env = TransformedEnv(env, Compose(InitTracker(), latent_actor.make_tensordict_primer()))
+    expected = env.rollout(6, latent_actor)
+
+    td = start.select("goal", *MEMORY).set("pixels", frames["pixels"][:, -1])
+    for t in range(6):
+        td = actor(td)
+        for key in ("latent", "action", *MEMORY):
+            torch.testing.assert_close(td[key], expected[key][:, t], rtol=1e-5, atol=1e-6)
+        td = td["next"].set("goal", start["goal"])
+    with pytest.raises(KeyError, match="predicted_latent"):
+        actor(start.select("goal"))
 
 
 @torch.no_grad()
 def test_memory_is_cleared_where_an_episode_begins():
     actor = make_actor()
-    td = TensorDict(
-        {
-            "pixels": torch.randint(0, 256, (2, 3, 64, 64), dtype=torch.uint8),
-            "goal": torch.rand(2, 2),
-            "is_init": torch.tensor([[True], [False]]),
-            **{key: torch.ones(2, 24) for key in ("hidden1", "cell1", "hidden2", "cell2")},
-        },
-        [2],
-    )
-    fresh = actor(td.select("pixels", "goal"))
-    out = actor(td)
-    torch.testing.assert_close(out["action"][0], fresh["action"][0])
-    assert not torch.allclose(out["action"][1], fresh["action"][1])
+    td = make_frames()[:, 0].select("pixels", "goal")
+    fresh = actor(td.clone())
+    sizes = dict.fromkeys(MEMORY, 24) | dict.fromkeys(POLICY_MEMORY, 20)
+    td.update({key: torch.ones(2, size) for key, size in sizes.items()})
+    out = actor(td.set("is_init", torch.tensor([[True], [False]])))
+    for key in ("action", ("next", "predicted_latent"), ("next", "hidden2"), ("next", "policy_hidden2")):
+        torch.testing.assert_close(out[key][0], fresh[key][0])
+        assert not torch.allclose(out[key][1], fresh[key][1]), key
+
+
+def test_keys_can_be_renamed_and_nested():
+    plain, frames = make_actor(), make_frames()
+    memory = tuple(("m", key) for key in MEMORY)
+    names = {"pixels": ("camera", "front"), "goal": ("agent", "goal"), "action": ("agent", "action")}
+    actor = Actor(plain.world_model, plain.policy, latent=("m", "z"), memory=memory, **names)
+    td = frames[:, 0].select("pixels", "goal")
+    renamed = TensorDict({("camera", "front"): td["pixels"], ("agent", "goal"): td["goal"]}, [2])
+    out, expected = actor(renamed), plain(td)
+    assert torch.equal(out["agent", "action"], expected["action"])
+    assert torch.equal(out["m", "z"], expected["latent"])
+    assert torch.equal(out["next", "m", "cell2"], expected["next", "cell2"])
 
 
 def test_actor_runs_in_a_collector():
@@ -68,14 +137,3 @@ def test_actor_runs_in_a_collector():
     frames = [batch.numel() for batch in collector]
     collector.shutdown()
     assert frames == [20, 20]
-
-
-def test_evaluation_rollout_matches_the_environments_rollout():
-    actor = make_actor()
-    out = roll_out(actor, "balance_reaching", [3, 4], keep_pixels=True)
-    env = DynmapBatchedEnv(num_envs=2)
-    td = env.reset(TensorDict({"scene_seed": torch.tensor([3, 4])}, [2]))
-    for t in range(out.shape[1]):
-        assert torch.equal(td["dynamics", "position"], out["dynamics", "position"][:, t])
-        td = env.step(td.set("action", out["action"][:, t]))["next"]
-    assert torch.equal(td["position_error"], out["next", "position_error"][:, -1])

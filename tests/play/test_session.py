@@ -1,28 +1,24 @@
-"""What drives a played world, and what the world model says of it, without a window."""
+"""Drivers of a session and the world model's predictions, without a window."""
 
 import numpy as np
 import pytest
 import torch
+from small import CONSTANTS, make_model
 from tensordict import TensorDict
 
-from dynmap_rl.data.demonstrations import load_meta
-from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.envs.scene import scene_seed
 from dynmap_rl.envs.tasks import TASKS
+from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.evaluation.rollout import roll_out
-from dynmap_rl.modules.actor import Actor
+from dynmap_rl.modules.actor import MEMORY, Actor
 from dynmap_rl.modules.checkpoints import make_policy
-from dynmap_rl.modules.checkpoints import make_world_model
-from dynmap_rl.play.session import Hand
-from dynmap_rl.play.session import Session
+from dynmap_rl.play.session import Hand, Session
 
 
 @pytest.fixture(scope="module")
-def actor(recording):
-    torch.manual_seed(0)
-    constants = load_meta(recording)["normalization"]
-    world_model = make_world_model(constants, ("position", "velocity"), latent_size=16, hidden_size=24)
-    return Actor(world_model.eval(), make_policy(constants, "recurrent", world_model, width=16).eval())
+def actor():
+    world_model = make_model().eval()
+    return Actor(world_model, make_policy(CONSTANTS, "recurrent", world_model, width=16).eval())
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -31,7 +27,7 @@ def test_the_expert_succeeds_and_its_episode_is_a_demonstration(task):
     session.driver = "expert"
     while not session.over:
         session.step()
-    session.step()  # nothing: it is over
+    session.step()  # does nothing, as the episode is over
     assert session.succeeded and session.drove == {"expert"}
     episode = session.episode()
     assert episode.shape == (1, 120)
@@ -47,35 +43,49 @@ def test_the_expert_succeeds_and_its_episode_is_a_demonstration(task):
 def test_a_policy_drives_as_in_its_evaluation(actor):
     session = Session("balance_reaching", actor, seed=3)
     assert session.driver == "policy"
-    for _ in range(120):
+    for _ in range(30):
         session.step()
-    expected = roll_out(actor, "balance_reaching", [scene_seed("validation", 3)])
+    expected = roll_out(actor, "balance_reaching", [scene_seed("validation", 3)])[:, :30]
     found = session.episode()
     torch.testing.assert_close(found["dynamics", "position"], expected["dynamics", "position"])
     predicted = np.stack(session.trace["position", "predicted"])
     assert np.isnan(predicted[0]).all()
     reference = expected["predicted_dynamics", "position"][0].numpy()
-    np.testing.assert_allclose(predicted[1:120], reference[1:], atol=1e-5)
+    np.testing.assert_allclose(predicted[1:30], reference[1:], atol=1e-5)
 
 
-def test_imagination_goes_on_without_frames(actor):
-    seen, blind = Session("balance_reaching", actor), Session("balance_reaching", actor)
-    for session in (seen, blind):
-        session.driver = "expert"
+@pytest.mark.parametrize("driver", ["expert", "policy"])
+@torch.no_grad()
+def test_imagination_continues_without_frames(actor, driver):
+    looking, blind = Session("balance_reaching", actor), Session("balance_reaching", actor)
+    for session in (looking, blind):
+        session.driver = driver
         for _ in range(5):
             session.step()
     blind.imagining = True
-    blind.td["pixels"] = torch.zeros_like(blind.td["pixels"])  # it does not look
-    latent, (state, _) = blind.states[0], blind.memory
-    wanted = torch.as_tensor(blind._expert_action(), dtype=torch.float32)[None]
-    blind.step()
-    world_model = actor.world_model
-    with torch.no_grad():
-        predicted, state = world_model.step(latent, wanted, state)
-        expected = world_model.decode_dynamics(predicted, state[0], state[2])["position"][0]
+    blind.td["pixels"] = torch.zeros_like(blind.td["pixels"])  # not encoded
+    memory, world_model = blind.memory.clone(), actor.world_model
+    action = torch.as_tensor(blind._expert_action(), dtype=torch.float32)[None]
+    if driver == "policy":
+        action = actor(memory.clone().set("goal", blind.td["goal"]))["action"]
+    predicted, state = world_model.step(
+        memory["predicted_latent"], action, tuple(memory[key] for key in MEMORY)
+    )
+    expected = world_model.decode_dynamics(predicted, state[0], state[2])["position"][0]
+    for session in (looking, blind):
+        session.step()
     np.testing.assert_allclose(blind.prediction["position"], expected.numpy(), atol=1e-5)
-    seen.step()
-    assert not np.allclose(seen.prediction["position"], blind.prediction["position"])
+    torch.testing.assert_close(blind.memory["predicted_latent"], predicted)
+    assert not np.allclose(looking.prediction["position"], blind.prediction["position"])
+
+
+def test_imagination_from_the_first_step_begins_with_a_frame(actor):
+    plain, imagining = Session("balance_reaching", actor), Session("balance_reaching", actor)
+    imagining.imagining = True
+    for session in (plain, imagining):
+        session.step()
+    for key in ("predicted_latent", *MEMORY):
+        assert torch.equal(plain.memory[key], imagining.memory[key])
 
 
 def test_the_hand_goes_where_it_points_and_stops_there():
@@ -86,7 +96,7 @@ def test_the_hand_goes_where_it_points_and_stops_there():
         session.step()
     assert np.abs(session.world.position[:2] - (0.6, 0.4)).max() < 0.01
     assert np.abs(session.world.velocity[:2]).max() < 0.02
-    assert not session.world.dropped, "gently"
+    assert not session.world.dropped
 
 
 def test_keys_move_at_the_limit_of_speed():
@@ -106,4 +116,5 @@ def test_the_next_scene_begins_anew(actor):
     session.restart()
     assert session.scene_seed == first + 1 and not session.imagining
     assert (session.world.steps, session.steps, session.prediction, session.drove) == (0, [], {}, set())
+    assert session.memory.is_empty()
     assert len(session.trace["velocity", "true"]) == 1

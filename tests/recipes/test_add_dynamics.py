@@ -1,4 +1,4 @@
-"""The add_dynamics recipe: the columns, their statistics, and a new folder that is whole or absent."""
+"""The add_dynamics recipe: the columns, their statistics, and a new folder that is complete or absent."""
 
 import contextlib
 import json
@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from commands import run
-from foreign_dataset import CAMERA, FPS, make_foreign
+from robot_dataset import CAMERA, FPS, make_robot_dataset
 
 from dynmap_rl.data.demonstrations import load_dataset
 from recipes.add_dynamics import Config, main
@@ -24,14 +24,14 @@ LENGTHS = (31, 47, 24, 33)
 
 
 def make_pair(folder, videos):
-    source, output = make_foreign(folder / "source", LENGTHS, videos), folder / "output"
+    source, output = make_robot_dataset(folder / "source", LENGTHS, videos), folder / "output"
     main(Config(dataset=str(source), output=output, columns="0,1,2", angles="2"))
     return source, output
 
 
 @pytest.fixture(scope="module", autouse=True)
 def folder_of_runs(tmp_path_factory):
-    """Where the recipe leaves its pages."""
+    """Return the folder of the recipe's pages."""
     with contextlib.chdir(tmp_path_factory.mktemp("runs")):
         yield Path.cwd() / "runs/add_dynamics"
 
@@ -48,17 +48,17 @@ def videos(tmp_path_factory):
 
 @pytest.fixture(params=["images", "videos"])
 def pair(request):
-    """A foreign dataset, and the one with dynamics of x, y and the angle."""
+    """Return a robot dataset, and its copy with dynamics of x, y and the angle."""
     return request.getfixturevalue(request.param)
 
 
 def open_with_lerobot(root):
-    from dynmap_rl.data.format.writing import quiet
+    from dynmap_rl.data.format.quiet import quiet
 
     with quiet():
         from lerobot.datasets import LeRobotDataset
 
-        return LeRobotDataset("test/foreign", root=root, video_backend="pyav")
+        return LeRobotDataset("test/robot", root=root, video_backend="pyav")
 
 
 def read(root, column):
@@ -153,11 +153,11 @@ def check(stats, values):
         assert (error <= 0.2 * spread + 1e-6).all(), name  # LeRobot's are those of a histogram
 
 
-def test_what_it_says_of_our_own_recordings_is_near_the_simulators_truth(recording, tmp_path, capsys):
+def test_derived_dynamics_of_our_recordings_are_near_the_simulators(recording, tmp_path, capsys):
     """Positions are known, velocities within a tenth, accelerations, which jump every step, roughly."""
     settings = {"dataset": str(recording), "state": "dynamics.position", "angles": "2,5"}
     main(Config(**settings, output=tmp_path / "derived", replace=True))
-    assert "velocity differs from the column that was there by 0.00" in capsys.readouterr().out
+    assert "velocity" in capsys.readouterr().out
     truth, derived = load_dataset(recording), load_dataset(tmp_path / "derived")
     assert set(truth.keys(True, True)) == set(derived.keys(True, True))
     for quantity, bound in (("position", 1e-6), ("velocity", 0.12), ("acceleration", 0.7)):
@@ -166,15 +166,13 @@ def test_what_it_says_of_our_own_recordings_is_near_the_simulators_truth(recordi
     assert torch.equal(truth["pixels"], derived["pixels"])
 
 
-def test_dynamics_of_another_size_are_of_no_task_of_ours(recording, tmp_path):
+def test_dynamics_of_another_size_are_of_no_task(recording, tmp_path):
     main(Config(dataset=str(recording), output=tmp_path / "tracked", track=True, replace=True))
-    with pytest.raises(ValueError, match=r"dynamics.position of \(2,\), not \(6,\): .* --task none"):
-        load_dataset(tmp_path / "tracked")
-    result = run(tmp_path, "decoupled", "--smoke", "--dataset", tmp_path / "tracked")
-    assert result.returncode == 2 and "train on this one with --task none" in result.stderr
+    result = run(tmp_path, "decoupled", "--dataset", tmp_path / "tracked", "--run", tmp_path / "run")
+    assert result.returncode == 2 and "recipes/robot.py" in result.stderr
 
 
-def test_positions_from_the_picture(pair, tmp_path):
+def test_positions_from_the_frames(pair, tmp_path):
     main(Config(dataset=str(pair[0]), output=tmp_path / "tracked", track=True))
     position, state = read(tmp_path / "tracked", "dynamics.position"), read(pair[0], "observation.state")
     assert open_with_lerobot(tmp_path / "tracked").meta.features["dynamics.position"]["names"] == ["x", "y"]
@@ -187,10 +185,13 @@ def test_one_entry_is_a_column_of_numbers(images, tmp_path):
     assert open_with_lerobot(tmp_path / "one")[40]["dynamics.velocity"].numel() == 1
 
 
+@pytest.mark.slow
 def test_a_killed_run_leaves_nothing_that_looks_done(images, tmp_path):
     output = tmp_path / "output"
     arguments = "--dataset", str(images[0]), "--output", str(output)
-    kill = "import os; from dynmap_rl.data import columns; columns._write_stats = lambda *a: os._exit(9);"
+    kill = (
+        "import os; from dynmap_rl.data.format import columns; columns._write_stats = lambda *a: os._exit(9);"
+    )
     code = f"{kill} import runpy, sys; sys.argv[1:] = {list(arguments)}; runpy.run_path({str(RECIPE)!r}, run_name='__main__')"
     killed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=os.environ)
     assert killed.returncode == 9, killed.stderr
@@ -202,21 +203,18 @@ def test_a_killed_run_leaves_nothing_that_looks_done(images, tmp_path):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"state": "observation.nothing"}, "no column 'observation.nothing' of numbers; choose --state from"),
-        ({"columns": "0,4"}, "are different ones of 0 to 3"),
-        ({"columns": "a"}, "--columns are whole numbers such as 0,1,2, not 'a'"),
-        ({"columns": "0,1", "angles": "2"}, r"--angles \[2\] are not among --columns \[0, 1\]"),
-        ({"method": "spline"}, "--method is one of central, savgol"),
-        ({"method": "savgol", "window": 4}, "odd --window"),
-        ({"method": "savgol", "window": 25}, "episode 2 has 24 steps"),
-        (
-            {"track": True, "camera": "front"},
-            "no camera 'front'; choose --camera from observation.images.top",
-        ),
-        ({"dataset": "no/where/here"}, "no dataset at no/where/here"),
-        ({"dataset": None}, "name the dataset"),
-        ({"track": True, "columns": "0"}, "--columns says nothing with --track"),
-        ({"camera": "observation.images.top"}, "--camera says nothing without --track"),
+        ({"state": "observation.nothing"}, "observation.nothing"),
+        ({"columns": "0,4"}, "--columns"),
+        ({"columns": "a"}, "--columns.*'a'"),
+        ({"columns": "0,1", "angles": "2"}, "--angles"),
+        ({"method": "spline"}, "--method"),
+        ({"method": "savgol", "window": 4}, "--window"),
+        ({"method": "savgol", "window": 25}, "24"),
+        ({"track": True, "camera": "front"}, "--camera .*observation.images.top.*'front'"),
+        ({"dataset": "no/where/here"}, "no/where/here"),
+        ({"dataset": None}, "--dataset"),
+        ({"track": True, "columns": "0"}, "--columns has no effect with --track"),
+        ({"camera": "observation.images.top"}, "--camera has no effect with.*--track"),
     ],
 )
 def test_bad_input_is_refused_before_anything_is_written(images, tmp_path, settings, message):
@@ -225,9 +223,9 @@ def test_bad_input_is_refused_before_anything_is_written(images, tmp_path, setti
     assert not any(tmp_path.iterdir())
 
 
-def test_a_folder_that_exists_and_columns_that_are_there_are_one_line(images, tmp_path):
-    result = run(tmp_path, "add_dynamics", "--dataset", str(images[0]), "--output", str(images[1]))
+def test_a_folder_and_columns_that_exist_are_refused(images, tmp_path):
+    result = run(tmp_path, "add_dynamics", "--dataset", images[0], "--output", images[1])
     assert (result.returncode, result.stderr.count("\n")) == (2, 1)
-    assert result.stderr.startswith(f"error: {images[1]} exists")
-    with pytest.raises(ValueError, match=r"has dynamics.position, .* already; --replace"):
+    assert str(images[1]) in result.stderr
+    with pytest.raises(ValueError, match=r"dynamics\.position.*--replace"):
         main(Config(dataset=str(images[1]), output=tmp_path / "again"))

@@ -1,162 +1,113 @@
+"""Decoupled training as a command: results, resuming, and what is refused."""
+
 import json
-import os
 import shutil
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
-from commands import open_in_browser, run
-from safetensors.torch import load_file, save_file
+from commands import PRESETS, place_recordings, run, run_small
 
-from dynmap_rl.envs.tasks import TASKS
-from dynmap_rl.training.dataset import find_or_record
-from recipes.decoupled import Config, main
+from dynmap_rl.utils.files import read_json, write_json
 
-RECIPE = Path(__file__).parents[2] / "recipes" / "decoupled.py"
+NAME = "runs/decoupled/balance_reaching/position_velocity_recurrent"
+WEIGHTS = "world_model/weights.safetensors"
 
 
 @pytest.fixture(scope="module")
-def smoke(tmp_path_factory):
-    """One smoke run as a process with no other option: it records, trains, evaluates and draws."""
-    folder = tmp_path_factory.mktemp("smoke")
-    command = [sys.executable, str(RECIPE), "--smoke"]
-    result = subprocess.run(command, cwd=folder, env=os.environ, capture_output=True, text=True)
-    assert result.returncode == 0, result.stderr
-    return folder, result
+def small(tmp_path_factory, small_run, recordings):
+    """Return a folder with a finished run, and its output."""
+    folder = shutil.copytree(
+        small_run, tmp_path_factory.mktemp("decoupled"), dirs_exist_ok=True, symlinks=True
+    )
+    place_recordings(folder, recordings, "bin_dropping")
+    return folder, (small_run / "printed.txt").read_text()
 
 
-def test_smoke_run_leaves_everything_behind(smoke):
-    folder, result = smoke
-    run_folder = folder / "runs/decoupled/balance_reaching/position_velocity_recurrent_smoke"
-    assert "RGB+[P+V], recurrent policy" in result.stdout
-    assert "DR 5 (2.5) %   PE 23 (3.7) mm   SR 89 (0.9) %" in result.stdout  # the paper's row
-    evaluation = json.loads((run_folder / "eval.json").read_text())
+def test_a_run_has_results_figures_and_a_page(small):
+    folder, printed = small
+    assert "RGB+[P+V], recurrent policy" in printed
+    assert "89 (0.9)" in printed, "the paper's success rate"
+    evaluation = read_json(folder / NAME / "eval.json")
     assert evaluation["row"] == "RGB+[P+V]"
     assert evaluation["trained_on"]["episodes"] == 4
     assert evaluation["test_protocol"]["episodes"] == 3
-    assert len(evaluation["results"][0]["test"]["rows"]["success"]) == 3
+    assert evaluation["settings"]["world_model"]["updates"] == 4
+    assert evaluation["command"].startswith("python recipes/decoupled.py --config_path ")
     for name in ("figures/reconstruction.png", "figures/dynamics.png", "rollouts.gif"):
-        assert (run_folder / name).stat().st_size > 1000
-    assert not (run_folder / "features").exists()
-    page = (run_folder / "report.html").read_text()
-    assert "SR 89 (0.9) %" in page and page.count('src="data:image/') == 3
+        assert (folder / NAME / name).stat().st_size > 1000
+    assert not (folder / NAME / "features").exists()
+    page = (folder / NAME / "report.html").read_text()
+    assert "89 (0.9)" in page and page.count('src="data:image/') == 3
 
 
-def test_its_page_is_whole_in_a_browser(smoke, tmp_path):
-    folder, _ = smoke
-    page = folder / "runs/decoupled/balance_reaching/position_velocity_recurrent_smoke/report.html"
-    seen = open_in_browser(page, tmp_path / "page.png")
-    assert seen["loaded"] and seen["console"] == []
-    assert seen["requests"] == [page.as_uri()[:100]], "nothing from elsewhere"
-    assert len(seen["images"]) == 3 and min(seen["images"]) > 100, "reconstruction, dynamics and rollouts"
-    assert seen["drawings"] and min(seen["drawings"]) > 500, "the curves"
-    for said in ("RGB+[P+V], recurrent policy", "SR 89 (0.9) %", "Rollouts in closed loop", "policy_updates"):
-        assert said in seen["text"]
+def test_the_same_command_prints_the_result_again(small):
+    folder, printed = small
+    before = (folder / NAME / WEIGHTS).stat().st_mtime_ns
+    again = run_small(folder, "decoupled", "--compute.threads", "2")
+    assert "complete" in again.stdout and printed.split("\n")[1] in again.stdout
+    assert (folder / NAME / WEIGHTS).stat().st_mtime_ns == before
 
 
-def test_the_same_command_again_says_that_it_is_done(smoke, monkeypatch, capsys):
-    folder, first = smoke
-    monkeypatch.chdir(folder)
-    main(Config(smoke=True))
-    again = capsys.readouterr().out
-    assert "is done" in again
-    assert first.stdout.split("\n")[1] in again
+@pytest.mark.parametrize(
+    ("option", "name"),
+    [
+        ("--world_model.updates=7", "world_model.updates: 4 there, 7 here"),
+        ("--eval.split=validation", "eval.split"),
+    ],
+)
+def test_other_settings_are_refused_and_named(small, option, name):
+    result = run(small[0], "decoupled", "--config_path", PRESETS / "decoupled.yaml", option)
+    assert result.returncode == 2 and name in result.stderr
 
 
-def test_two_seeds_in_processes_on_a_world_model_that_is_there(smoke):
-    folder, _ = smoke
-    runs = folder / "runs/decoupled/balance_reaching"
-    trained = runs / "position_velocity_recurrent_smoke/world_model"
-    arguments = ["--policy", "feedforward", "--seeds", "0,1", "--world_model", str(trained)]
-    result = run(folder, "decoupled", "--smoke", *arguments)
-    assert result.returncode == 0, result.stderr
-    assert "recording" not in result.stderr
-    other = runs / "position_velocity_feedforward_smoke"
-    weights = "world_model/weights.safetensors"
-    assert (other / weights).read_bytes() == (trained.parent / weights).read_bytes()
+def test_a_run_of_the_first_release_is_refused_in_one_line(small, tmp_path):
+    folder = shutil.copytree(small[0] / NAME, tmp_path / "old")
+    write_json(folder / "config.json", {"task": "balance_reaching", "updates": 4, "policy_updates": 3})
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+    preset, data = PRESETS / "decoupled.yaml", small[0] / "datasets/balance_reaching"
+    result = run(tmp_path, "decoupled", "--config_path", preset, "--run", "old", "--dataset", data)
+    assert result.returncode == 2 and result.stderr.count("\n") == 1 and "--run" in result.stderr
+    assert before == {path: path.stat().st_mtime_ns for path in before}
+
+
+@pytest.mark.slow
+def test_policies_on_a_world_model_of_another_run(small):
+    folder, _ = small
+    run_small(
+        folder, "decoupled", *options(f"{NAME}/world_model"), "--policy.kind", "feedforward", "--seeds", "0,1"
+    )
+    other = folder / "runs/decoupled/balance_reaching/position_velocity_feedforward"
+    assert (other / WEIGHTS).read_bytes() == (folder / NAME / WEIGHTS).read_bytes()
     policies = [(other / f"seed_{seed}/policy/weights.safetensors").read_bytes() for seed in (0, 1)]
     assert policies[0] != policies[1]
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"supervision": "jerk"}, "unknown supervision"),
-        ({"policy": "transformer"}, "unknown policy"),
-        ({"dataset": "no/where/here"}, "no dataset at no/where/here"),
-        ({"world_model": Path("nowhere")}, "nowhere holds no finished run"),
-        ({"task": "juggling"}, "unknown task"),
-        ({"seeds": "0,0"}, "has one twice"),
-        ({"seeds": "a"}, "whole numbers"),
-        ({"window_steps": 500}, "window_steps must be"),
-        ({"test_episodes": 0}, "at least 1"),
-        ({"test_episodes": 1001}, "1000 shared start states"),
-        ({"split": "train"}, "test or validation"),
-    ],
-)
-def test_bad_input_is_refused_before_anything_is_written(tmp_path, settings, message):
-    with pytest.raises(ValueError, match=message):
-        main(Config(run=tmp_path / "bad", **settings))
-    assert not (tmp_path / "bad").exists()
+def options(pretrained):
+    """Return options that undo the preset's sizes of the world model, which have no effect with ``--pretrained``."""
+    sizes = {"updates": 2500, "windows": 16, "window_steps": 24, "rgb_steps": 8}
+    return ["--pretrained", pretrained, *(f"--world_model.{name}={size}" for name, size in sizes.items())]
 
 
 @pytest.mark.parametrize(
-    ("path", "settings", "message"),
+    ("path", "arguments", "message"),
     [
-        (
-            "",
-            {"supervision": "none"},
-            r"is a world model of balance_reaching, decoupled, supervised on \('pos",
-        ),
-        ("world_model", {"task": "bin_dropping"}, "is a world model of balance_reaching, .* use recipes/gen"),
-        ("seed_0/policy", {}, "holds no finished run"),
-        ("", {"updates": 5}, "--updates is of a world model's training, and that of --world_model is done"),
+        ("", ["--world_model.supervision", "none"], "--world_model.supervision none"),
+        ("world_model", ["--task", "bin_dropping"], "recipes/generalize.py"),
+        ("seed_0/policy", [], "no finished run"),
+        ("", ["--world_model.updates", "5"], "--world_model.updates has no effect with --pretrained"),
     ],
 )
-def test_a_world_model_of_another_row_is_refused(smoke, tmp_path, path, settings, message):
-    folder, _ = smoke
-    trained = folder / "runs/decoupled/balance_reaching/position_velocity_recurrent_smoke" / path
-    with pytest.raises(ValueError, match=message):
-        main(Config(smoke=True, world_model=trained, run=tmp_path / "bad", **settings))
-    assert not (tmp_path / "bad").exists()
+def test_a_world_model_that_does_not_fit_is_refused(small, path, arguments, message):
+    folder, _ = small
+    result = run(folder, "decoupled", "--pretrained", f"{NAME}/{path}", "--run", "runs/bad", *arguments)
+    assert result.returncode == 2 and message in result.stderr
+    assert not (folder / "runs/bad").exists()
 
 
-def test_a_world_model_that_is_no_longer_the_same_is_noticed(smoke, tmp_path):
-    folder, _ = smoke
-    source = tmp_path / "source"
-    shutil.copytree(folder / "runs/decoupled/balance_reaching/position_velocity_recurrent_smoke", source)
-    data = str(folder / "datasets/balance_reaching_smoke")
-    settings = {"smoke": True, "world_model": source, "run": tmp_path / "run", "dataset": data}
-    main(Config(**settings))
-    weights = source / "world_model/weights.safetensors"
-    save_file({name: value + 1 for name, value in load_file(weights).items()}, weights)
-    with pytest.raises(ValueError, match="was made with another world model"):
-        main(Config(**settings))
-
-
-def test_the_dataset_that_is_there_is_taken(recording, tmp_path, monkeypatch):
-    """Of any number of episodes, but of demonstrations of the task."""
-    monkeypatch.chdir(tmp_path)
-    shutil.copytree(recording, "datasets/balance_reaching")
-    assert find_or_record(Config()) == Path("datasets/balance_reaching")
-    for changes, message in (
-        ({"kind": "exploration"}, "is of exploration"),
-        ({"task": "bin_dropping"}, "is of bin"),
-    ):
-        path = Path("datasets/balance_reaching/meta/dynmap.json")
-        path.write_text(json.dumps(json.loads((recording / "meta/dynmap.json").read_text()) | changes))
-        with pytest.raises(ValueError, match=message):
-            find_or_record(Config())
-
-
-@pytest.mark.parametrize("task", sorted({*TASKS} - {"balance_reaching"}))
-def test_smoke_run_of_another_task(recordings, tmp_path, capsys, task):
-    main(Config(smoke=True, task=task, dataset=str(recordings(task)), run=tmp_path))
-    evaluation = json.loads((tmp_path / "eval.json").read_text())
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["balance_reaching_obstacle", "bin_dropping"])
+def test_other_tasks(recordings, tmp_path, task):
+    result = run_small(tmp_path, "decoupled", "--task", task, "--dataset", recordings(task), "--run", "run")
+    evaluation = json.loads((tmp_path / "run/eval.json").read_text())
     assert (evaluation["task"], evaluation["row"]) == (task, "RGB+[P+V]")
     assert evaluation["world_model"] == {"task": task, "training": "decoupled"}
-    assert evaluation["trained_on"]["episodes"] == 4
-    printed = capsys.readouterr().out
-    assert f"RGB+[P+V], recurrent policy, {task}" in printed
-    assert "\n  paper  " not in printed, "its world models are of task 1"
+    assert "paper" not in result.stdout, "its world models are of task 1"

@@ -1,110 +1,69 @@
+"""Policies for other tasks on a frozen world model of task 1, as commands."""
+
 import shutil
-from pathlib import Path
 
 import pytest
-from commands import place_recordings, run
+from commands import PRESETS, place_recordings, run, run_small
 from safetensors.torch import load_file, save_file
 
-from dynmap_rl.data.demonstrations import load_meta
-from dynmap_rl.runs.lookup import load_source
+from dynmap_rl.runs.lookup import SHIPPED
 from dynmap_rl.utils.files import read_json
-from dynmap_rl.utils.files import write_json
-from dynmap_rl.utils.weights import fingerprint
-from recipes.generalize import Config, main
+
+WEIGHTS = "world_model/weights.safetensors"
+TASK = "bin_dropping"
 
 
 @pytest.fixture(scope="module")
-def smoke(tmp_path_factory, recordings):
-    """A smoke run of task 1, and its world model taken to task 3."""
-    folder = tmp_path_factory.mktemp("smoke")
-    place_recordings(folder, recordings, "balance_reaching", "bin_dropping")
-    source = run(folder, "decoupled", "--smoke", "--supervision", "none")
-    assert source.returncode == 0, source.stderr
-    trained = "runs/decoupled/balance_reaching/none_recurrent_smoke"
-    result = run(folder, "generalize", "--smoke", "--task", "bin_dropping", "--world_model", trained)
-    assert result.returncode == 0, result.stderr
-    return folder, trained, result
+def small(tmp_path_factory, recordings):
+    """Return a folder with a finished run on a copy of the shipped world model, and the command's result."""
+    folder = tmp_path_factory.mktemp("generalize")
+    place_recordings(folder, recordings, "balance_reaching", TASK)
+    shutil.copytree(SHIPPED / "balance_reaching", folder / "runs/source")
+    return folder, run_small(folder, "generalize", "--task", TASK, "--pretrained", "runs/source")
 
 
-def test_the_world_model_is_that_of_task_1(smoke):
-    folder, trained, _ = smoke
-    run_folder = folder / "runs/generalize/bin_dropping/decoupled_none_recurrent_smoke"
+def test_the_world_model_is_that_of_task_1(small):
+    folder, result = small
+    [run_folder] = (folder / "runs/generalize" / TASK).iterdir()
     evaluation = read_json(run_folder / "eval.json")
-    assert evaluation["task"] == "bin_dropping"
+    assert evaluation["task"] == TASK
     assert evaluation["world_model"] == {"task": "balance_reaching", "training": "decoupled"}
-    assert evaluation["world_model_sha256"] == read_json(folder / trained / "eval.json")["world_model_sha256"]
-    weights = "world_model/weights.safetensors"
-    assert (run_folder / weights).read_bytes() == (folder / trained / weights).read_bytes()
-    assert load_meta(folder / "datasets/bin_dropping_smoke")["task"] == "bin_dropping"
-
-
-def test_the_row_stands_beside_the_papers_table_3(smoke):
-    _, _, result = smoke
-    assert "Only-RGB of balance_reaching, recurrent policy, bin_dropping" in result.stdout
-    assert "SR 44 (0.0) %" in result.stdout
+    source = folder / "runs/source" / WEIGHTS
+    ours, theirs = load_file(run_folder / WEIGHTS), load_file(source)
+    assert ours.keys() == theirs.keys() and all(ours[name].equal(theirs[name]) for name in ours)
+    assert "53 (3.4)" in result.stdout, "the paper's success rate"
     assert "DR" not in result.stdout, "the paper reports the success rate alone"
 
 
-def test_the_same_command_again_says_that_it_is_done(smoke):
-    folder, trained, _ = smoke
-    again = run(folder, "generalize", "--smoke", "--task", "bin_dropping", "--world_model", trained)
-    assert again.returncode == 0
-    assert "is done" in again.stdout
+def test_the_same_command_prints_the_result_again(small):
+    folder, _ = small
+    again = run_small(folder, "generalize", "--task", TASK, "--pretrained", "runs/source")
+    assert "complete" in again.stdout
 
 
-def test_the_folder_of_the_world_model_is_as_good_as_that_of_its_run(smoke):
-    folder, trained, _ = smoke
-    model, source = load_source(folder / trained)
-    same, same_source = load_source(folder / trained / "world_model")
-    assert fingerprint(model) == fingerprint(same)
-    assert source == same_source == {"task": "balance_reaching", "training": "decoupled"}
-
-
-def test_another_world_model_in_its_place_is_refused(smoke, tmp_path, monkeypatch):
-    folder, trained, _ = smoke
+def test_another_world_model_in_its_place_is_refused(small, tmp_path):
+    folder, _ = small
     shutil.copytree(folder / "runs", tmp_path / "runs")
-    monkeypatch.chdir(tmp_path)
-    weights = tmp_path / trained / "world_model/weights.safetensors"
+    weights = tmp_path / "runs/source" / WEIGHTS
     state = load_file(weights)
     next(iter(state.values())).view(-1)[0] += 1e-3
     save_file(state, weights)
-    with pytest.raises(ValueError, match="was made with another world model"):
-        main(Config(smoke=True, task="bin_dropping", world_model=Path(trained)))
-
-
-def test_a_jointly_trained_world_model_stands_beside_the_papers(smoke, tmp_path, monkeypatch, capsys):
-    folder, trained, _ = smoke
-    source = shutil.copytree(folder / trained, tmp_path / "source")
-    joint = {"task": "balance_reaching", "training": "joint"}
-    write_json(source / "eval.json", read_json(source / "eval.json") | {"world_model": joint})
-    monkeypatch.chdir(tmp_path)
-    dataset = str(folder / "datasets/bin_dropping_smoke")
-    main(Config(smoke=True, task="bin_dropping", world_model=source, dataset=dataset))
-    assert "SR 46 (1.6) %" in capsys.readouterr().out
-    result = read_json("runs/generalize/bin_dropping/joint_none_recurrent_smoke/eval.json")
-    assert result["world_model"] == joint
+    arguments = "--config_path", PRESETS / "generalize.yaml", "--task", TASK, "--pretrained", "runs/source"
+    result = run(tmp_path, "generalize", *arguments)
+    assert result.returncode == 2 and "another world model" in result.stderr
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--task", "balance_reaching"], "was trained on balance_reaching itself"),
-        (["--task", "juggling"], "unknown task"),
-        (
-            ["--world_model", "nowhere"],
-            "holds no finished run; train a world model with recipes/decoupled.py",
-        ),
-        (
-            ["--task", "bin_dropping", "--dataset", "datasets/balance_reaching_smoke"],
-            "is of balance_reaching, not of",
-        ),
+        (["--task", "balance_reaching"], "balance_reaching for both"),
+        (["--task", "juggling"], "juggling"),
+        (["--task", TASK, "--pretrained", "nowhere"], "nowhere holds no finished run"),
+        (["--task", TASK, "--dataset", "datasets/balance_reaching"], "must be a dataset of bin_dropping"),
     ],
 )
-def test_bad_input_is_refused_before_anything_is_written(smoke, arguments, message):
-    folder, trained, _ = smoke
-    if "--world_model" not in arguments:
-        arguments = ["--world_model", trained, *arguments]
-    result = run(folder, "generalize", "--smoke", "--run", "runs/bad", *arguments)
-    assert result.returncode == 2
-    assert message in result.stderr and "Traceback" not in result.stderr
+def test_bad_input_is_refused_before_anything_is_written(small, arguments, message):
+    folder, _ = small
+    result = run(folder, "generalize", "--run", "runs/bad", "--pretrained", "runs/source", *arguments)
+    assert result.returncode == 2 and message in result.stderr
     assert not (folder / "runs/bad").exists()

@@ -1,16 +1,11 @@
-"""The probe recipe on untrained world models, and what its numbers mean."""
+"""The probe recipe on untrained world models."""
 
 import pytest
-import torch
 from commands import run
 
-from dynmap_rl.data.demonstrations import load_dataset
 from dynmap_rl.data.demonstrations import load_meta
-from dynmap_rl.evaluation import probing  # MODULE
-from dynmap_rl.modules.checkpoints import make_world_model
-from dynmap_rl.modules.checkpoints import save_world_model
-from dynmap_rl.utils.files import read_json
-from dynmap_rl.utils.files import write_json
+from dynmap_rl.modules.checkpoints import make_world_model, save_world_model
+from dynmap_rl.utils.files import read_json, write_json
 
 
 @pytest.fixture(scope="module")
@@ -33,36 +28,19 @@ def test_writes_errors_and_probes_of_every_world_model(trained, recording, tmp_p
     assert len(facts["open_loop"]["RGB+[P], decoupled"]["model"]["cart_mm"]) == 4
     assert list(facts["probes"]) == ["Only-RGB, decoupled", "RGB+[P], decoupled"]
     assert len(facts["probes"]["Only-RGB, decoupled"]["latent"]["velocity"]) == 6
-    assert "RGB+[P], decoupled: after 0.2 s without frames the cart is" in result.stdout
     for name in ("open_loop", "probes"):
         assert (tmp_path / f"runs/probe/{name}.png").stat().st_size > 10_000
     page = (tmp_path / "runs/probe/report.html").read_text()
-    assert page.count("data:image/png") == 2 and "after 0.2 s without frames the cart is" in page
-
-
-def test_a_linear_map_tells_what_is_linear_and_nothing_of_what_is_independent(recording, monkeypatch):
-    train, test = load_dataset(recording, "train"), load_dataset(recording, "eval")
-    mix = torch.randn(6, 40, generator=torch.Generator().manual_seed(0))
-
-    def features(_, episodes):
-        position = episodes["dynamics", "position"]
-        noise = torch.randn(*position.shape[:-1], 40, generator=torch.Generator().manual_seed(len(episodes)))
-        return {"latent": 5 * position @ mix + 3, "hidden1": noise, "hidden2": torch.zeros_like(noise)}
-
-    monkeypatch.setattr(probing, "compute_features", features)
-    r2 = probing.probe(None, train, test)
-    assert min(r2["latent"]["position"]) > 0.999
-    assert max(r2["hidden1"]["velocity"]) < 0.1
-    assert max(r2["hidden2"]["velocity"]) < 1e-9, "a constant is no better than the mean"
+    assert page.count("data:image/png") == 2 and all(line in page for line in result.stdout.splitlines()[:-1])
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--runs", "nothing"], "nothing holds no finished run"),
-        (["--runs", "none,none"], "has Only-RGB, decoupled twice"),
-        (["--runs", "none", "--test_episodes", "0"], "must be at least 1"),
-        (["--runs", "position", "--horizon", "200"], "do not fit into episodes of 120"),
+        (["--runs", "nothing"], "nothing"),
+        (["--runs", "none,none"], "Only-RGB, decoupled twice"),
+        (["--runs", "none", "--test_episodes", "0"], "test_episodes"),
+        (["--runs", "position", "--horizon", "200"], "120, got 20 + 200"),
     ],
 )
 def test_bad_input_is_refused_before_anything_is_written(trained, recording, arguments, message):

@@ -1,9 +1,7 @@
-"""The grid of the paper's tables: its cells, its runs, and what is printed of its results."""
+"""The grid of the paper's tables: choice of the cells, their runs, and the printed tables."""
 
 import json
 import os
-import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -16,143 +14,156 @@ import pytest
 from filelock import FileLock
 
 from dynmap_rl.paper.cells import list_cells
-from dynmap_rl.paper.published import TABLES
-from dynmap_rl.modules.supervision import parse_supervision
-from dynmap_rl.modules.supervision import row_name
-from dynmap_rl.paper.tables import COLUMNS
+from recipes.paper import tables
 
-RECIPE = Path(__file__).parents[2] / "recipes" / "tables.py"
-
-
+RECIPE = Path(tables.__file__)
 TASKS = "balance_reaching", "balance_reaching_obstacle", "bin_dropping"
+NAMES = [f"{task}_joint_none_recurrent" for task in TASKS]
+SMALL = "--results", "results", "--presets", str(commands.PRESETS)
 
 
 def run(folder, *arguments):
-    return commands.run(folder, "tables", "--results", "results", *arguments)
+    return commands.run(folder, "tables", *SMALL, *arguments)
 
 
-def test_there_is_a_cell_for_every_one_of_the_paper():
-    cells = list_cells()
-    assert len({cell.name for cell in cells}) == len(cells)
-    by_name = {cell.name: cell for cell in cells}
-    expected = {(*column, row) for column, rows in TABLES.items() for row in rows}
-    found = set()
-    for cell in cells:
-        if "world_model_" in cell.name:
-            continue
-        source = by_name[cell.needs] if cell.needs else cell
-        options = dict(zip(source.arguments[::2], source.arguments[1::2], strict=True))
-        supervision = parse_supervision(options.get("--supervision", "none"))
-        own = dict(zip(cell.arguments[::2], cell.arguments[1::2], strict=True))
-        training = "decoupled" if source.recipe == "decoupled" else "joint"
-        row = row_name(supervision, source.recipe)
-        task = own.get("--task", "balance_reaching")
-        found.add((task, training, own.get("--policy", "recurrent"), row))
-    assert found == expected
+def done(result) -> list[str]:
+    """Cells that the recipe has run."""
+    lines = result.stdout.splitlines()
+    return [line.removeprefix("done: ") for line in lines if line.startswith("done: ")]
 
 
-def test_a_table_is_chosen_alone(tmp_path):
-    """By the task of its columns, and with the world models of task 1 that tables II and III need."""
+def listed(folder, *arguments):
+    lines = run(folder, "--dry_run", *arguments).stdout.splitlines()
+    return {line.split()[-1] for line in lines[:-1]}, lines[-1]
 
-    def listed(*arguments):
-        lines = run(tmp_path, "--dry_run", *arguments).stdout.splitlines()
-        return {line.split()[-1] for line in lines[:-1]}, lines[-1]
 
+def test_a_table_is_chosen_with_the_world_models_that_it_needs(tmp_path):
     by_name = {cell.name: cell for cell in list_cells()}
-    first, said = listed("--table", "I")
-    own = {name for name, cell in by_name.items() if cell.task == "balance_reaching"}
-    assert first == own and "0 of 35 cells" in said
-    assert sum("world_model_" in name for name in first) == 10, "the further world models of the claims"
-    for table, columns in COLUMNS.items():
-        [task] = {column[0] for column in columns}
-        found, said = listed("--table", table)
+    for table, task in zip(("I", "II", "III"), TASKS, strict=True):
+        found, said = listed(tmp_path, "--table", table)
         cells = {name for name, cell in by_name.items() if cell.task == task}
-        needed = {by_name[name].needs for name in cells} - {None}
-        assert found == cells | needed
-        minutes = sum(by_name[name].minutes for name in found)
-        assert said.endswith(f"about {minutes / 60:.1f} hours of one core are left")
-    assert listed("--table", "I,II,III") == listed() and len(listed()[0]) == len(by_name)
-    two, _ = listed("--table", "II, III", "--only", "joint_none")
-    assert two == {f"{task}_joint_none_recurrent" for task in TASKS}
-    one, _ = listed("--table", "I", "--only", "joint_none")
-    assert one == {"balance_reaching_joint_none_recurrent"}
+        assert found == cells | ({by_name[name].needs for name in cells} - {None})
+        assert f"about {sum(by_name[name].minutes for name in found) / 60:.1f} hours" in said
+    assert listed(tmp_path, "--table", "I,II,III") == listed(tmp_path) and len(listed(tmp_path)[0]) == len(
+        by_name
+    )
+    assert listed(tmp_path, "--table", "II,III", "--only", "joint_none")[0] == set(NAMES)
+    assert listed(tmp_path, "--table", "I", "--only", "joint_none")[0] == set(NAMES[:1])
 
 
-def done(result):
-    """The cells that the recipe says it has run, and then where its page is."""
-    *cells, page = result.stdout.splitlines()
-    assert page == "written: runs/tables_smoke/report.html"
-    return [line.removeprefix("done: ") for line in cells]
+def fake_script(calls):
+    """Return a stand-in for ``run_script`` that keeps the arguments and writes a result."""
+
+    def run_script(script, arguments, folder, log):
+        given = dict(zip(arguments[::2], arguments[1::2], strict=True))
+        calls.append((script.stem, given))
+        log.write_text("error: no luck\n")
+        if "unlucky" in os.environ.get("CELLS", "") and given["--run"].endswith(NAMES[0]):
+            return 2
+        task = given.get("--task", TASKS[0])
+        run, flags = folder / given["--run"], {"success": "110", "dropped": "000", "touched": "000"}
+        rows = flags | {"first_scene_seed": 0, "position_error": [0.01] * 3}
+        metrics = {"DR": 0.0, "PE": 10.0, "SR": 66.7}
+        run.mkdir(parents=True)
+        (run / "eval.json").write_text(json.dumps({
+            "task": task, "policy": "recurrent", "row": "Only-RGB", "settings": {"world_model": {"seed": 0}},
+            "world_model": {"task": TASKS[0], "training": "joint"}, "results": [{"test": {"rows": rows}}],
+            "test_protocol": metrics | {"episodes": 3}, "paper_protocol": {k: (v, 0.0) for k, v in metrics.items()},
+            "seeds": [0], "command": "python x.py",
+        }))  # fmt: skip
+        return 0
+
+    return run_script
 
 
-def test_cells_run_once_and_are_printed_beside_the_paper(recordings, tmp_path):
-    commands.place_recordings(tmp_path, recordings, *TASKS)
-    smoke = "--smoke", "--only", "joint_none"
-    result = run(tmp_path, *smoke)
+@pytest.fixture
+def calls(monkeypatch, recordings, tmp_path):
+    """Calls of the cells' recipes, which are not run."""
+    calls = []
+    monkeypatch.setattr("dynmap_rl.utils.processes.run_script", fake_script(calls))
+    monkeypatch.setattr("dynmap_rl.training.dataset.find_or_record", lambda task, dataset=None: None)
+    return calls
+
+
+def test_cells_run_once_and_are_printed_beside_the_paper(calls, tmp_path):
+    result = run(tmp_path, "--only", "joint_none")
     assert result.returncode == 0, result.stderr
-    names = [f"{task}_joint_none_recurrent" for task in TASKS]
-    assert done(result) == names
-    page = (tmp_path / "runs/tables_smoke/report.html").read_text()
-    assert "Table III, joint, recurrent" in page and "| Only-RGB | 46 (1.6) | " in page
-    assert sorted(p.stem for p in (tmp_path / "results").iterdir()) == sorted(names)
-
-    times = {path: path.stat().st_mtime_ns for path in (tmp_path / "results").iterdir()}
-    (tmp_path / "results/bin_dropping_joint_none_recurrent.json").unlink()
-    again = run(tmp_path, *smoke)
-    assert done(again) == ["bin_dropping_joint_none_recurrent"]
-    assert all(path.stat().st_mtime_ns == time for path, time in times.items() if "bin" not in path.name)
-
-    said, page = run(tmp_path, *smoke).stdout.splitlines()
-    assert said.startswith("nothing to do: 3 cells are in results")
-    assert page == "written: runs/tables_smoke/report.html"
-
-    shutil.rmtree(tmp_path / "runs")  # as in a fresh clone, where results are but no runs
-    (tmp_path / "results/bin_dropping_joint_none_recurrent.json").unlink()
-    fresh = run(tmp_path, "--smoke", "--only", "bin_dropping_joint_none_recurrent")
-    assert done(fresh) == [names[0], names[2]], fresh.stderr
-    assert all(path.stat().st_mtime_ns == time for path, time in times.items() if "bin" not in path.name)
+    assert done(result) == NAMES
+    assert [recipe for recipe, _ in calls] == ["joint", "generalize", "generalize"]
+    assert {given["--pretrained"] for _, given in calls[1:]} == {f"runs/tables/{NAMES[0]}"}
+    assert {given["--compute.threads"] for _, given in calls} == {"2"}
+    assert calls[0][1]["--config_path"] == str(commands.PRESETS / "joint.yaml")
+    assert "| Only-RGB | 46 (1.6) | " in (tmp_path / "runs/tables/report.html").read_text()
+    assert sorted(path.stem for path in (tmp_path / "results").iterdir()) == sorted(NAMES)
 
     rows = json.loads(run(tmp_path, "--print", "json").stdout)
     assert [(r["table"], r["row"], r["column"], r["n"]) for r in rows] == [
         (table, "Only-RGB", "joint, recurrent", 3) for table in ("I", "II", "III")
     ]
-    assert rows[2]["paper"]["SR"] == [46, 1.6]
-    text = run(tmp_path, "--print", "markdown").stdout
-    assert "| Only-RGB | 64 (5.9); 17, 92 |" in text
-    assert re.search(r"^\| Only-RGB \| 21 / - \| 73 / - \| 64 / \*\*\d", text, re.M)
-    dry = run(tmp_path, "--dry_run").stdout
-    assert dry.count("   done  ") == 3 and "3 of 69 cells are done" in dry
+    assert "| Only-RGB | 64 (5.9); 17, 92 |" in run(tmp_path, "--print", "markdown").stdout
+    assert run(tmp_path, "--print", "findings").returncode == 0
+    assert run(tmp_path, "--dry_run").stdout.count("   done  ") == 3
 
 
+def test_only_cells_without_a_result_run_and_the_world_models_that_they_need(calls, tmp_path):
+    run(tmp_path, "--only", "joint_none")
+    (tmp_path / f"results/{NAMES[2]}.json").unlink()
+    (tmp_path / f"runs/tables/{NAMES[2]}").rename(tmp_path / "old")
+    assert done(run(tmp_path, "--only", "joint_none")) == NAMES[2:]
+    assert done(run(tmp_path, "--only", "joint_none")) == []
+    (tmp_path / "runs").rename(tmp_path / "runs_of_old")  # results are there, but no runs
+    (tmp_path / f"results/{NAMES[2]}.json").unlink()
+    assert done(run(tmp_path, "--only", NAMES[2])) == [NAMES[0], NAMES[2]]
+
+
+def test_a_failed_cell_is_reported_with_those_that_need_it(calls, tmp_path, monkeypatch):
+    monkeypatch.setenv("CELLS", "unlucky")
+    result = run(tmp_path, "--only", "joint_none", "--workers", "2")
+    assert result.returncode == 2 and calls[0][1]["--compute.threads"] == "1"
+    assert (
+        f"{NAMES[0]} failed; see runs/tables/{NAMES[0]}.log, which ends with: error: no luck" in result.stderr
+    )
+    assert NAMES[2] in result.stderr and len(result.stderr.splitlines()) == 1
+
+
+@pytest.mark.slow
+def test_real_cells(recordings, tmp_path):
+    commands.place_recordings(tmp_path, recordings, *TASKS)
+    result = run(tmp_path, "--only", "joint_none")
+    assert done(result) == NAMES, result.stderr
+    rows = json.loads(run(tmp_path, "--print", "json").stdout)
+    assert [row["n"] for row in rows] == [3, 3, 3]
+
+
+@pytest.mark.slow
 def test_ray_runs_the_same_cells(recordings, tmp_path, monkeypatch):
     pytest.importorskip("ray")
     commands.place_recordings(tmp_path, recordings, *TASKS[:2])
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-    (tmp_path / "runs/tables_smoke/bin_dropping_joint_none_recurrent").mkdir(parents=True)
-    (tmp_path / "runs/tables_smoke/bin_dropping_joint_none_recurrent/config.json").write_text("{}")
-    command = [sys.executable, str(RECIPE), "--results", "results", "--smoke", "--only", "joint_none"]
-    command += ["--launcher", "ray", "--cpus", "1"]
-    for _ in range(3):  # Ray gives its own processes 30 s to start, which a busy machine may need longer for
+    (tmp_path / "runs/tables" / NAMES[2]).mkdir(parents=True)
+    (tmp_path / "runs/tables" / NAMES[2] / "config.json").write_text(
+        "{}"
+    )  # of another release: the cell fails
+    (tmp_path / "datasets/bin_dropping").symlink_to(recordings(TASKS[2]), target_is_directory=True)
+    command = [
+        sys.executable,
+        str(RECIPE),
+        *SMALL,
+        "--only",
+        "joint_none",
+        "--launcher",
+        "ray",
+        "--cpus",
+        "1",
+    ]
+    for _ in range(3):  # Ray allows its processes 30 s to start, which a busy machine may exceed
         result = subprocess.run(command, cwd=tmp_path, env=os.environ, capture_output=True, text=True)
         if "timed out during startup" not in result.stderr:
             break
-    names = ["balance_reaching_joint_none_recurrent", "balance_reaching_obstacle_joint_none_recurrent"]
-    assert done(result) == names, result.stderr
-    assert sorted(p.stem for p in (tmp_path / "results").iterdir()) == sorted(names)
-    assert result.returncode == 2
-    assert "bin_dropping_joint_none_recurrent failed; see runs/tables_smoke/" in result.stderr
-
-
-def test_a_cell_that_fails_says_where_to_look_and_the_others_go_on(tmp_path):
-    (tmp_path / "runs/tables_smoke/balance_reaching_joint_none_recurrent").mkdir(parents=True)
-    (tmp_path / "runs/tables_smoke/balance_reaching_joint_none_recurrent/config.json").write_text("{}")
-    result = run(tmp_path, "--smoke", "--only", "joint_none")
-    assert result.returncode == 2
-    assert "balance_reaching_joint_none_recurrent failed; see runs/tables_smoke/" in result.stderr
-    assert "bin_dropping_joint_none_recurrent waits for its world model" in result.stderr
-    assert "joint_none_recurrent.log, which ends with: error: " in result.stderr
-    assert "holds a run with other settings" in result.stderr
+    assert sorted(done(result)) == NAMES[:2], result.stderr
+    assert sorted(path.stem for path in (tmp_path / "results").iterdir()) == NAMES[:2]
+    assert result.returncode == 2 and f"{NAMES[2]} failed" in result.stderr
 
 
 @pytest.mark.slow
@@ -165,12 +176,11 @@ def test_what_stops_the_command_stops_its_cells_and_begins_no_other(recordings, 
     """Ctrl-C, which a terminal sends to all processes, and a kill of the first one alone."""
     commands.place_recordings(tmp_path, recordings, TASKS[0])
     first, second = (
-        tmp_path / f"runs/tables_smoke/balance_reaching_joint_{row}_recurrent"
+        tmp_path / f"runs/tables/balance_reaching_joint_{row}_recurrent"
         for row in ("velocity", "velocity_acceleration")
     )
-    smoke = "--smoke", "--results", "results", "--only"
-    command = [sys.executable, str(RECIPE), *smoke, "balance_reaching_joint_velocity"]
-    heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # which tests in the background do not
+    command = [sys.executable, str(RECIPE), *SMALL, "--only", "balance_reaching_joint_velocity"]
+    heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # tests in the background ignore it
     with subprocess.Popen(command, cwd=tmp_path, start_new_session=True, preexec_fn=heed) as process:
         while not (first / "config.json").exists():
             assert process.poll() is None
@@ -179,18 +189,21 @@ def test_what_stops_the_command_stops_its_cells_and_begins_no_other(recordings, 
     assert process.returncode == (1 if number == signal.SIGINT else -number)
     with FileLock(first / ".lock", timeout=60):
         assert not (first / "eval.json").exists() and not second.exists()
-    again = commands.run(tmp_path, "tables", *smoke, first.name)
+    again = run(tmp_path, "--only", first.name)
     assert done(again) == [first.name], again.stderr
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--only", "nothing"], "no cell's name holds"),
-        (["--table", "II", "--only", "balance_reaching_joint"], "no cell's name holds"),
-        (["--table", "I,IV"], "--table is I, II or III, or several with commas between, not 'I,IV'"),
-        (["--print", "html"], "markdown, json or findings"),
-        (["--launcher", "slurm"], "local or ray"),
+        (["--only", "nothing"], "'nothing'"),
+        (["--table", "II", "--only", "balance_reaching_joint"], "'balance_reaching_joint'"),
+        (["--table", "I,IV"], "'I,IV'"),
+        (["--print", "html"], "'html'"),
+        (["--launcher", "slurm"], "'slurm'"),
+        (["--cpus", "4"], "--cpus"),
+        (["--write"], "--results"),
+        (["--workers", "0"], "workers"),
     ],
 )
 def test_bad_input_gets_one_clear_line(tmp_path, arguments, message):

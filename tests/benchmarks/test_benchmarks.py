@@ -1,0 +1,115 @@
+"""Every benchmark runs in a minimal size, and the page holds the stored numbers."""
+
+import importlib
+import math
+import multiprocessing
+import os
+import subprocess
+from pathlib import Path
+
+import commands
+import pytest
+import torch
+from stress import kills
+
+from dynmap_rl.data import load_dataset, load_meta, sample_windows
+from dynmap_rl.keys import DYNAMICS
+from dynmap_rl.modules.checkpoints import make_world_model
+from dynmap_rl.objectives.world_model import WorldModelLoss
+from dynmap_rl.utils.cli import parse_settings, read_arguments
+
+SMALL = {
+    "control_step": {},
+    "frame": {},
+    "pusht": {},
+    "batch": {"num_envs": 2, "steps": 2},
+    "processes": {"num_envs": 2, "steps": 2, "amount": 100},
+    "ppo": {"seeds": (0,), "iterations": 2, "num_envs": 2, "episodes": 2},
+    "training": {"count": 2, "steps": 4, "updates": 1},
+    "training_decode_8": {"count": 2, "steps": 10, "updates": 1},
+    "windows": {"batches": 1},
+    "to_tensordict": {"count": 10},
+    "evaluation": {"episodes": 2, "single": 1},
+    "import": {},
+    "help": {"pattern": "tables.py"},
+}
+
+
+@pytest.fixture
+def load(monkeypatch):
+    """Return a function from the name of a benchmark to its module."""
+    monkeypatch.syspath_prepend(Path(__file__).parent)
+    return importlib.import_module
+
+
+@pytest.mark.stress
+def test_the_plain_world_model_is_the_same_model(load, recording):
+    """Loss and gradients, in float32 and with every frame decoded."""
+    torch.manual_seed(0)
+    windows = sample_windows(load_dataset(recording, "train"), 2, 5, torch.Generator().manual_seed(0))
+    model = make_world_model(load_meta(recording)["normalization"], DYNAMICS)
+    plain = load("learning").PlainWorldModel(model)
+    ours, theirs = sum(WorldModelLoss(model)(windows).values()), plain.loss(windows, None)
+    torch.testing.assert_close(theirs, ours, rtol=1e-5, atol=0)
+    shared = [p for name, p in model.named_parameters() if "lstm" not in name]
+    lstm = [p for name, p in model.named_parameters() if "lstm" in name]
+    ours, theirs = (
+        torch.autograd.grad(loss, [*shared, *own])
+        for loss, own in ((ours, lstm), (theirs, plain.cells.parameters()))
+    )
+    for a, b in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(b, a, rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.stress
+@pytest.mark.parametrize("row", SMALL)
+@pytest.mark.filterwarnings("ignore:.*use of fork", "ignore:You have specified a mini-batch size")
+def test_every_row_runs(load, recording, tmp_path, monkeypatch, row):
+    """Once, in a minimal size, and without processes that import everything again."""
+
+    def compare(ours, theirs, repeats=1):
+        a, b = ours(), theirs()
+        return {"ours": a, "theirs": b, "ratio": a / b}
+
+    def run_here(command, **_):
+        assert commands.run(tmp_path, "expert", *command[2:]).returncode == 0
+
+    if row == "pusht" and "PUSHT_PYTHON" not in os.environ:
+        pytest.skip("gym-pusht needs an environment of its own")
+    if row == "processes":
+        context = multiprocessing.get_context("fork")
+        monkeypatch.setattr(multiprocessing, "get_context", lambda method: context)
+    if row == "ppo":
+        pytest.importorskip("stable_baselines3")
+        monkeypatch.setattr(load("ppo"), "GOAL", 0.0)
+        monkeypatch.setattr(subprocess, "run", run_here)
+    for name in ("learning", "loading", "simulation", "starting"):
+        monkeypatch.setattr(load(name), "compare", compare)
+    run = load("run")
+    monkeypatch.setattr(run, "DATASET", str(recording))
+    threads = torch.get_num_threads()
+    try:
+        found = run.ROWS[row][-1](**SMALL[row])
+    finally:
+        torch.set_num_threads(threads)
+    assert all(0 < found[key] < math.inf for key in ("ours", "theirs", "ratio"))
+    assert len(run.speed_table({"rows": {row: found}}).splitlines()) == 3, "the head and the row"
+
+
+def test_every_row_is_tried(load):
+    assert set(load("run").ROWS) == set(SMALL)
+
+
+def test_the_page_holds_the_stored_numbers(load):
+    run = load("run")
+    text = run.PAGE.read_text()
+    assert run.page(text) == text, "python tests/benchmarks/run.py --write"
+    assert run.page(text.replace("**", "")) == text
+
+
+def test_commands_of_other_scripts_are_understood(load):
+    """The commands run for hours; here only their options are parsed."""
+    listed = [(name, arguments.split()) for name, arguments in kills.COMMANDS.items()]
+    for recipe, arguments in [*load("memory").COMMANDS.items(), *listed]:
+        config_class = importlib.import_module(f"recipes.{recipe.replace('/', '.')}").Config
+        parse_settings(config_class, read_arguments(arguments, config_class))

@@ -1,0 +1,144 @@
+"""The LeRobot policy ``dynmap``: windows, losses, constants, control."""
+
+import dataclasses
+import shutil
+
+import pytest
+import torch
+from lerobot.datasets import LeRobotDataset
+from lerobot.datasets.factory import resolve_delta_timestamps
+from lerobot.policies import make_policy, make_policy_config, make_pre_post_processors
+from tensordict import TensorDict
+
+from dynmap_rl.data.demonstrations import load_dataset, load_meta
+from dynmap_rl.integrations.lerobot.configuration_dynmap import DynmapConfig
+from dynmap_rl.integrations.lerobot.modeling_dynmap import DynmapPolicy
+from dynmap_rl.modules.actor import Actor
+from dynmap_rl.utils.weights import fingerprint
+
+SMALL = {"device": "cpu", "push_to_hub": False, "window_steps": 6, "rgb_steps": 2}
+
+
+def load_windows(recording, policy, starts, episodes=None):
+    """Return a batch of LeRobot's loader and preprocessor: windows that begin at these frames."""
+    arguments = {"root": recording, "episodes": episodes, "video_backend": "pyav"}
+    dataset = LeRobotDataset("user/small", **arguments)
+    delta = resolve_delta_timestamps(policy.config, dataset.meta)
+    dataset = LeRobotDataset("user/small", **arguments, delta_timestamps=delta)
+    batch = torch.utils.data.default_collate([dataset[i] for i in starts])
+    return make_pre_post_processors(policy.config, dataset_stats=dataset.meta.stats)[0](batch)
+
+
+def new_policy(recording, episodes=None, **settings):
+    dataset = LeRobotDataset("user/small", root=recording, episodes=episodes, video_backend="pyav")
+    return make_policy(make_policy_config("dynmap", **(SMALL | settings)), ds_meta=dataset.meta)
+
+
+def test_windows_are_those_of_our_own_loader(recording):
+    policy = new_policy(recording)
+    batch = load_windows(recording, policy, [0, 130, 237])  # the last goes 3 steps beyond its episode
+    windows = policy.make_windows(batch)
+    episodes = load_dataset(recording)
+    assert windows.shape == (3, 6)
+    for row, episode, steps in (
+        (0, 0, range(6)),
+        (1, 1, range(10, 16)),
+        (2, 1, [117, 118, 119, 119, 119, 119]),
+    ):
+        expected = episodes[episode][list(steps)]
+        for key in ("pixels", "action", "goal", "dynamics"):
+            assert (windows[row][key] == expected[key]).all(), key
+        assert torch.equal(windows["disturbed"][row], expected["disturbed"])
+        there = [row != 2 or step < 3 for step in range(6)]
+        assert windows["collector", "mask"][row].tolist() == there
+
+
+def test_a_part_from_the_middle_has_its_own_dynamics(recording, tmp_path):
+    """LeRobot may have downloaded the files of some episodes only."""
+    part = shutil.copytree(recording, tmp_path / "part")
+    files = sorted((part / "data").glob("*/*.parquet"))
+    assert len(files) == 3, "two episodes in each"
+    files[0].unlink(), files[2].unlink()
+    policy = new_policy(part, [2, 3])
+    windows = policy.make_windows(load_windows(part, policy, [0, 130], [2, 3]))
+    expected = load_dataset(recording)[2:4]
+    assert (windows["dynamics"][0] == expected["dynamics"][0, :6]).all()
+    assert (windows["dynamics"][1] == expected["dynamics"][1, 10:16]).all()
+    assert torch.equal(windows["disturbed"][1], expected["disturbed"][1, 10:16])
+
+    shutil.copy(files[1], files[2])
+    with pytest.raises(ValueError, match="index"):
+        new_policy(part, [2, 3])
+
+
+@pytest.mark.parametrize(
+    ("supervision", "kind", "terms"),
+    [
+        ("none", "feedforward", {"rgb", "latent", "policy"}),
+        ("position,acceleration", "recurrent", {"rgb", "latent", "policy", "position", "acceleration"}),
+    ],
+)
+def test_the_loss_is_that_of_the_config(recording, supervision, kind, terms):
+    policy = new_policy(recording, supervision=supervision, kind=kind).train()
+    loss, parts = policy(load_windows(recording, policy, [0, 130]))
+    loss.backward()
+    assert set(parts) == {f"loss_{term}" for term in terms}
+    assert loss.item() == pytest.approx(sum(parts.values()), rel=1e-5)
+    assert all(p.grad is not None for p in policy.parameters())
+
+
+def test_constants_are_those_of_the_recording_and_are_saved(recording, tmp_path):
+    policy = new_policy(recording)
+    constants = load_meta(recording)["normalization"]
+    normalizer = policy.world_model.dynamics_decoder.normalizers["velocity"]
+    assert torch.allclose(normalizer.center + normalizer.scale, torch.tensor(constants["velocity"]["high"]))
+    policy.save_pretrained(tmp_path)
+    loaded = DynmapPolicy.from_pretrained(tmp_path, strict=True)  # without the dataset
+    assert fingerprint(loaded) == fingerprint(policy)
+    assert dataclasses.replace(loaded.config) == dataclasses.replace(policy.config)
+    with pytest.raises(ValueError, match="dataset_meta"):
+        loaded(load_windows(recording, policy, [0]))
+
+
+@pytest.mark.parametrize("kind", ["recurrent", "feedforward"])
+@torch.no_grad()
+def test_actions_are_the_actors_step_by_step_and_again_after_a_reset(recording, kind):
+    policy = new_policy(recording, kind=kind)
+    episode = load_dataset(recording)[:2, :5]
+    actor = Actor(policy.world_model, policy.policy, mixed=True)
+    memory, expected = TensorDict({}, [2]), []
+    for t in range(5):
+        td = actor(episode[:, t].select("pixels", "goal").update(memory))
+        expected.append(td["action"])
+        memory = td["next"]
+
+    def act():
+        actions = []
+        for t in range(5):
+            frames = episode["pixels"][:, t] / 255
+            batch = {"observation.images.front": frames, "observation.state": episode["agent_pos"][:, t]}
+            actions.append(policy.select_action(batch))
+        return torch.stack(actions, 1)
+
+    assert torch.equal(act(), torch.stack(expected, 1))
+    assert not torch.equal(act()[:, 0], expected[0]), "the memory is kept until a reset"
+    policy.reset()
+    assert torch.equal(act(), torch.stack(expected, 1))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"supervision": "speed"}, "speed"),
+        ({"kind": "transformer"}, "transformer"),
+        ({"window_steps": 1}, "window_steps"),
+    ],
+)
+def test_wrong_settings_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        DynmapConfig(**(SMALL | settings))
+
+
+def test_missing_features_are_refused():
+    with pytest.raises(ValueError, match="camera"):
+        DynmapPolicy(DynmapConfig(**SMALL))

@@ -1,0 +1,88 @@
+"""World model loss: its terms, their scale, and the time step that each term compares."""
+
+import pytest
+import torch
+from small import CONSTANTS
+from tensordict import TensorDict
+from torch.nn.functional import pixel_unshuffle
+
+from dynmap_rl.keys import DYNAMICS
+from dynmap_rl.modules.checkpoints import make_world_model
+from dynmap_rl.objectives.world_model import WorldModelLoss, rms
+
+CONSTANTS = CONSTANTS | {q: {"low": [-2.0] * 6, "high": [2.0] * 6} for q in DYNAMICS}
+
+
+def batch(b=2, t=5):
+    return TensorDict(
+        {
+            "pixels": torch.randint(0, 256, (b, t, 3, 64, 64), dtype=torch.uint8),
+            "action": 0.02 * torch.randn(b, t, 3),
+            "dynamics": {q: torch.rand(b, t, 6) for q in DYNAMICS},
+        },
+        [b, t],
+    )
+
+
+def make(supervision=DYNAMICS, **arguments):
+    torch.manual_seed(0)
+    model = make_world_model(CONSTANTS, supervision, latent_size=16, hidden_size=24)
+    return model, WorldModelLoss(model, **arguments)
+
+
+@pytest.mark.parametrize("supervision", [(), ("velocity", "acceleration"), DYNAMICS])
+def test_the_losses_are_those_of_the_supervision(supervision):
+    _, loss = make(supervision)
+    losses = loss(batch())
+    assert set(losses.keys()) == {"loss_rgb", "loss_latent", *(f"loss_{q}" for q in supervision)}
+    assert all(value.shape == () and value > 0 for value in losses.values())
+
+
+@torch.no_grad()
+def test_dynamics_loss_is_the_norm_of_the_normalised_error_from_t_1_on():
+    model, loss = make(("velocity",))
+    td = batch()
+    states = model.predict(model.encode(td["pixels"]), td["action"])
+    error = (model.decode_dynamics(*states)["velocity"] - td["dynamics", "velocity"]) / 2.0
+    expected = error[:, 1:].norm(dim=-1).mean() / 6**0.5
+    torch.testing.assert_close(loss(td)["loss_velocity"], expected, rtol=1e-4, atol=1e-6)
+    td["dynamics", "velocity"][:, 0] += 100.0  # there is no prediction for t = 0
+    torch.testing.assert_close(loss(td)["loss_velocity"], expected, rtol=1e-4, atol=1e-6)
+
+
+def test_a_model_that_copies_its_input_frame_predicts_a_delayed_sequence_only():
+    """An off-by-one in the comparison would fail here."""
+    _, loss = make(())
+    frames = torch.randint(0, 256, (1, 6, 3, 64, 64), dtype=torch.uint8)
+    # The prediction for t is the frame of t - 1.
+    loss.world_model.image_decoder.decode_blocks = lambda *_: pixel_unshuffle(frames[:, :-1] / 255 - 0.5, 4)
+    td = TensorDict({"pixels": frames, "action": torch.zeros(1, 6, 3)}, [1, 6])
+    assert loss(td)["loss_rgb"] > 0.1
+    td["pixels"] = torch.cat([frames[:, :1], frames[:, :-1]], 1)
+    assert loss(td)["loss_rgb"] < 1e-3
+
+
+def test_stop_gradient_keeps_the_latent_loss_out_of_the_target():
+    model, loss = make((), beta_z=1.0, stop_gradient=True)
+    torch.nn.init.zeros_(model.transition.change.weight)
+    loss(batch())["loss_latent"].backward()
+    assert model.transition.change.bias.grad.abs().sum() > 0
+    assert all(p.grad is None or p.grad.abs().sum() == 0 for p in model.encoder.parameters())
+    model, loss = make((), beta_z=1.0, stop_gradient=False)
+    loss(batch())["loss_latent"].backward()
+    assert any(p.grad.abs().sum() > 0 for p in model.encoder.parameters())
+
+
+def test_weights_scale_their_terms():
+    torch.manual_seed(1)
+    td = batch()
+    _, plain = make(("position",), beta_z=1.0, beta_dynamics=1.0)
+    _, heavy = make(("position",), beta_z=2.0, beta_dynamics=3.0)
+    torch.testing.assert_close(heavy(td)["loss_latent"], 2 * plain(td)["loss_latent"])
+    torch.testing.assert_close(heavy(td)["loss_position"], 3 * plain(td)["loss_position"])
+
+
+def test_rms_has_a_gradient_at_zero():
+    x = torch.zeros(3, requires_grad=True)
+    rms(x).backward()
+    assert x.grad.isfinite().all()

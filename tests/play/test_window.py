@@ -1,0 +1,75 @@
+"""Keys, mouse and picture of the play window, without a display."""
+
+import pytest
+from small import CONSTANTS, make_model
+
+from dynmap_rl.envs.renderer import pygame
+from dynmap_rl.modules.actor import Actor
+from dynmap_rl.modules.checkpoints import make_policy
+from dynmap_rl.play.session import Session
+from dynmap_rl.play.window import PlayWindow
+
+
+def press(window, *names):
+    for name in names:
+        for kind in (pygame.KEYDOWN, pygame.KEYUP):
+            pygame.event.post(pygame.event.Event(kind, key=pygame.key.key_code(name)))
+    window.handle()
+
+
+@pytest.fixture
+def window():
+    window = PlayWindow(Session("balance_reaching"), size=128)
+    yield window
+    window.close()
+
+
+def test_keys_and_mouse(window):
+    played = window.session
+    press(window, "tab")
+    assert played.driver == "expert"
+    pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=pygame.K_LEFT))
+    window.handle()
+    assert played.driver == "hand" and played.hand.direction.tolist() == [-1, 0, 0]
+    pygame.event.post(pygame.event.Event(pygame.KEYUP, key=pygame.K_LEFT))
+    window.handle()
+    assert played.hand.direction.tolist() == [0, 0, 0]
+    middle = {"pos": (8 + 64, 8 + 20 + 64), "button": 1}
+    pygame.event.post(pygame.event.Event(pygame.MOUSEBUTTONDOWN, middle))
+    window.handle()
+    assert played.hand.target == (0.5, 0.5)
+    pygame.event.post(pygame.event.Event(pygame.MOUSEBUTTONUP, middle))
+    press(window, "space", "b")
+    assert played.hand.target is None and window.paused and window.body == 0
+    first = played.scene_seed
+    press(window, "r", "i", "f5")
+    assert played.scene_seed != first and not played.imagining
+    press(window, "escape")
+    assert not window.open
+
+
+def test_the_window_shows_the_scene_and_traces(window):
+    before = window.draw()
+    window.session.driver = "expert"
+    for _ in range(20):
+        window.session.step()
+    after = window.draw()
+    assert after.shape == (window.height, window.width, 3)
+    assert (before != after).any(-1).sum() > 100
+
+
+def test_with_a_world_model_its_prediction_is_shown():
+    world_model = make_model()
+    session = Session(
+        "balance_reaching", Actor(world_model, make_policy(CONSTANTS, "recurrent", world_model))
+    )
+    window = PlayWindow(session, size=64)
+    right = 2 * 8 + 64
+    session.step()
+    before = window.draw()[28 : 28 + 64, right : right + 64]
+    assert (before == session.prediction["pixels"]).all()
+    press(window, "i")
+    assert session.imagining
+    session.step()
+    assert (window.draw()[28 : 28 + 64, right : right + 64] == session.prediction["pixels"]).all()
+    window.close()

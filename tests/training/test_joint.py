@@ -1,0 +1,67 @@
+"""Joint and end-to-end training: what learns, and that threads and kills change no weight."""
+
+import pytest
+import torch
+from small import CONSTANTS, END_TO_END, JOINT, Stop, judge, load, make_episodes, make_model, read_weights
+
+from dynmap_rl.modules.checkpoints import make_policy
+from dynmap_rl.runs.folder import read_metrics
+from dynmap_rl.training import PolicyArchitecture, WorldModelArchitecture, train_seeds
+from dynmap_rl.training import joint as module
+from dynmap_rl.training.joint import train_end_to_end, train_jointly
+from dynmap_rl.utils.devices import Compute
+from dynmap_rl.utils.weights import fingerprint
+
+FORM = WorldModelArchitecture("position"), PolicyArchitecture("feedforward")
+
+
+def train(folder, settings=JOINT, seeds=(0,), threads=1):
+    compute = Compute("cpu", threads)
+    return train_seeds(load, folder, *FORM, settings, judge=judge, seeds=seeds, compute=compute)
+
+
+@pytest.mark.parametrize(("function", "settings"), [(train_jointly, JOINT), (train_end_to_end, END_TO_END)])
+def test_world_model_and_policy_learn(tmp_path, function, settings):
+    model = make_model()
+    policy = make_policy(CONSTANTS, "recurrent", model, width=16)
+    parts = model.encoder, model.transition, model.image_decoder, model.dynamics_decoder, policy
+    before = [fingerprint(part) for part in parts]
+    function(model, policy, make_episodes(), tmp_path, settings)
+    changed = [fingerprint(part) != old for part, old in zip(parts, before, strict=True)]
+    jointly = function is train_jointly
+    assert changed == [True, True, jointly, jointly, True], "end to end, no decoder is trained"
+    row = read_metrics(tmp_path)[-1]
+    assert ("loss_rgb" in row, "held_out_loss" in row) == (jointly, True)
+
+
+@pytest.mark.slow
+def test_two_processes_give_the_same_weights_as_one(tmp_path):
+    firsts = [train(tmp_path / str(n), seeds=(0, 1), threads=n) for n in (1, 2)]
+    one, two = (read_weights(tmp_path / str(n)) for n in (1, 2))
+    assert one == two and fingerprint(firsts[0]) == fingerprint(firsts[1])
+    name = "world_model/weights.safetensors"
+    assert one[name] == one[f"seed_0/{name}"] != one[f"seed_1/{name}"], (
+        "every seed has a world model of its own"
+    )
+
+
+def test_a_killed_run_resumes_to_the_same_weights(tmp_path, monkeypatch):
+    train(tmp_path / "whole")
+
+    def stop(*args):
+        raise Stop
+
+    with monkeypatch.context() as patch, pytest.raises(Stop):
+        patch.setattr(module, "save_world_model", stop)
+        train(tmp_path / "killed")
+    torch.manual_seed(5)
+    train(tmp_path / "killed")
+    assert read_weights(tmp_path / "killed") == read_weights(tmp_path / "whole")
+
+
+def test_a_finished_seed_is_left_alone(tmp_path, monkeypatch):
+    train(tmp_path)
+    weights = read_weights(tmp_path)
+    monkeypatch.setattr(module, "fit", None)
+    train(tmp_path)
+    assert read_weights(tmp_path) == weights

@@ -1,0 +1,123 @@
+"""The loop over windows: it resumes to the same weights, and stops before a bad state is saved."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from small import WORLD_MODEL, Stop, make_episodes, make_model
+
+from dynmap_rl.data.settings import Augmentation
+from dynmap_rl.runs.folder import append_metrics, load_training_state, read_metrics
+from dynmap_rl.training import loop
+from dynmap_rl.training.loop import change_windows, check_loss
+from dynmap_rl.training.world_model import train_world_model
+from dynmap_rl.utils.weights import fingerprint
+
+
+def test_a_resumed_training_equals_an_uninterrupted_one(tmp_path, monkeypatch):
+    episodes, whole = make_episodes(), make_model()
+    train_world_model(whole, episodes, tmp_path / "whole", WORLD_MODEL, save_every=2)
+
+    save, descend, updates = loop.save_training_state, loop.descend, []
+
+    def save_then_stop(path, **state):
+        save(path, **state)
+        if state["update"] == 4:
+            raise Stop
+
+    with monkeypatch.context() as patch, pytest.raises(Stop):
+        patch.setattr(loop, "save_training_state", save_then_stop)
+        train_world_model(make_model(), episodes, tmp_path / "parts", WORLD_MODEL, save_every=2)
+    append_metrics(tmp_path / "parts", 5, loss_rgb=0.0)  # written after the last state, then killed
+    resumed = make_model()
+    monkeypatch.setattr(loop, "descend", lambda optimizer: updates.append(1) or descend(optimizer))
+    train_world_model(resumed, episodes, tmp_path / "parts", WORLD_MODEL, save_every=2)
+
+    assert len(updates) == 2, "saved updates are not repeated"
+    assert fingerprint(resumed) == fingerprint(whole)
+    assert read_metrics(tmp_path / "parts") == read_metrics(tmp_path / "whole")
+
+
+def test_weights_are_the_same_with_one_thread_or_two(tmp_path):
+    models, before = [make_model(), make_model()], torch.get_num_threads()
+    try:
+        for threads, model in enumerate(models, 1):
+            torch.set_num_threads(threads)
+            torch.manual_seed(threads)  # the training draws from generators of its own
+            train_world_model(model, make_episodes(), tmp_path / str(threads), WORLD_MODEL)
+    finally:
+        torch.set_num_threads(before)
+    assert fingerprint(models[0]) == fingerprint(models[1]) != fingerprint(make_model())
+
+
+def test_a_training_resumes_from_a_state_of_another_kind_of_device(tmp_path):
+    """The generators of a GPU have states of another shape."""
+    train_world_model(make_model(), make_episodes(), tmp_path, WORLD_MODEL)
+    path = tmp_path / "checkpoint/world_model.pt"
+    state = torch.load(path, weights_only=True)
+    torch.save({**state, "generators": [torch.zeros(16, dtype=torch.uint8)]}, path)
+    train_world_model(make_model(), make_episodes(), tmp_path, replace(WORLD_MODEL, updates=8))
+    assert read_metrics(tmp_path)[-1]["step"] == 8
+
+
+def train_from(update, change, folder, monkeypatch, **changes):
+    """Train on windows that are changed from an update on; return the error and the training state."""
+    sample, calls = loop.sample_windows, []
+
+    def sample_changed(*args):
+        calls.append(1)
+        windows = sample(*args)
+        return change(windows) if len(calls) > 2 * update else windows  # two parts an update
+
+    monkeypatch.setattr(loop, "sample_windows", sample_changed)
+    with pytest.raises(ValueError, match="lower learning rate") as error:
+        train_world_model(
+            make_model(), make_episodes(), folder, replace(WORLD_MODEL, updates=60, **changes), save_every=10
+        )
+    assert all(row["step"] <= update for row in read_metrics(folder))
+    return str(error.value), load_training_state(folder / "checkpoint/world_model.pt")
+
+
+def with_nan(windows):
+    windows["dynamics", "position"][:] = float("nan")
+    return windows
+
+
+def exploding(windows):
+    windows["dynamics", "position"].mul_(1e6)
+    return windows
+
+
+@pytest.mark.parametrize(("change", "message"), [(with_nan, "not finite"), (exploding, "diverges")])
+def test_a_loss_that_is_not_finite_or_diverges_keeps_the_last_state(tmp_path, monkeypatch, change, message):
+    error, state = train_from(10, change, tmp_path, monkeypatch)
+    assert message in error
+    assert state["update"] == 10 and all(value.isfinite().all() for value in state["model"].values())
+
+
+def test_a_learning_rate_that_is_too_high_stops_before_anything_is_saved(tmp_path, monkeypatch):
+    _, state = train_from(0, lambda windows: windows, tmp_path, monkeypatch, learning_rate=1e9)
+    assert state is None
+
+
+def test_a_gradient_that_is_not_finite_is_noticed_at_once():
+    """The loss of that update is still finite."""
+    assert check_loss(2.0, torch.tensor(5.0)) == 2.0
+    assert check_loss(2.0, torch.tensor(5.0), 3.0) == 3.0
+    with pytest.raises(ValueError, match="not finite"):
+        check_loss(2.0, torch.tensor(float("inf")))
+
+
+def test_windows_change_as_the_settings_say():
+    windows, generator = make_episodes()["train"], torch.Generator().manual_seed(0)
+    windows["pixels"][..., 20:, :] = torch.tensor([90, 120, 150], dtype=torch.uint8)[
+        :, None, None
+    ]  # background
+    same = change_windows(windows.clone(), Augmentation.off(), generator)
+    assert (same == windows).all()
+    for name, value in vars(Augmentation()).items():
+        changes = vars(Augmentation.off()) | {name: value}
+        changed = change_windows(windows.clone(), Augmentation(**changes), generator)
+        assert not torch.equal(changed["pixels"], windows["pixels"]), name
+        labels = torch.equal(changed["dynamics", "position"], windows["dynamics", "position"])
+        assert labels is (name in ("recolor", "distractors"))

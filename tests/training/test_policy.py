@@ -1,0 +1,41 @@
+"""Training of a policy on the states of a frozen world model."""
+
+import pytest
+import torch
+from small import CONSTANTS, POLICY, make_episodes, make_model
+
+from dynmap_rl.data.features import compute_features
+from dynmap_rl.modules.checkpoints import make_policy
+from dynmap_rl.runs.folder import read_metrics
+from dynmap_rl.training import train_policy
+from dynmap_rl.utils.weights import fingerprint
+
+
+@pytest.fixture
+def model():
+    return make_model().eval().requires_grad_(False)
+
+
+@pytest.fixture
+def features(model):
+    return compute_features(
+        model, make_episodes()["train"], copies=1, generator=torch.Generator().manual_seed(0)
+    )
+
+
+@pytest.mark.parametrize("kind", ["recurrent", "feedforward"])
+def test_the_policy_learns_and_the_world_model_stays(tmp_path, model, features, kind):
+    before, policy = fingerprint(model), make_policy(CONSTANTS, kind, model, width=16)
+    untrained = fingerprint(policy)
+    train_policy(policy, features, features, tmp_path / "new", POLICY, seed=3)
+    assert fingerprint(model) == before
+    assert fingerprint(policy) != untrained
+    [row] = read_metrics(tmp_path / "new")
+    assert row["step"] == POLICY.updates and row.keys() == {"step", "loss", "held_out_loss"}
+
+
+def test_a_loss_that_is_not_finite_stops_the_training(tmp_path, model, features):
+    features["action"][:] = float("nan")
+    with pytest.raises(ValueError, match="not finite"):
+        train_policy(make_policy(CONSTANTS, "recurrent", model), features, features, tmp_path, POLICY)
+    assert read_metrics(tmp_path) == []

@@ -1,0 +1,56 @@
+"""Settings: frozen, checked, importable without torch."""
+
+import subprocess
+import sys
+from dataclasses import FrozenInstanceError, fields
+
+import pytest
+
+from dynmap_rl.data.settings import Augmentation
+from dynmap_rl.evaluation.settings import Evaluation
+from dynmap_rl.training import settings
+from dynmap_rl.training.settings import JointTraining, PolicyTraining, PPOTraining, WorldModelTraining
+
+ALL = [kind for kind in vars(settings).values() if isinstance(kind, type)] + [Evaluation]
+
+
+@pytest.mark.parametrize("kind", ALL, ids=lambda kind: kind.__name__)
+def test_settings_are_frozen_and_hashable(kind):
+    """Mutable defaults would be shared between runs."""
+    values = kind()
+    assert hash(values) == hash(kind())
+    with pytest.raises(FrozenInstanceError):
+        setattr(values, fields(kind)[0].name, None)
+
+
+@pytest.mark.parametrize(
+    ("kind", "values"),
+    [
+        (WorldModelTraining, {"supervision": "speed"}),
+        (WorldModelTraining, {"supervision": "none,position"}),
+        (WorldModelTraining, {"updates": 0}),
+        (WorldModelTraining, {"window_steps": 1}),
+        (WorldModelTraining, {"learning_rate": -1e-3}),
+        (PolicyTraining, {"kind": "transformer"}),
+        (PolicyTraining, {"copies": -1}),
+        (JointTraining, {"beta_joint": -1}),
+        (JointTraining, {"windows": 0}),
+        (PPOTraining, {"epochs": 0}),
+        (Augmentation, {"max_shift": -1}),
+        (Evaluation, {"split": "train"}),
+        (Evaluation, {"episodes": 0}),
+        (Evaluation, {"episodes": 1001}),
+    ],
+)
+def test_a_bad_value_is_refused_and_named(kind, values):
+    [(name, value)] = values.items()
+    with pytest.raises(ValueError, match=rf"\.{name} must .*{value}"):
+        kind(**values)
+
+
+def test_torch_is_not_imported():
+    code = (
+        "import sys; from dynmap_rl.training import WorldModelTraining; from dynmap_rl.evaluation import Evaluation; "
+        "WorldModelTraining(), Evaluation(); print('torch' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "False\n"

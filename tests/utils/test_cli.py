@@ -1,0 +1,167 @@
+"""Recipes as commands: options, nested defaults, and errors in one line."""
+
+import ast
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import torch
+
+from dynmap_rl.utils.cli import MEMORY, command_line, parse_seeds, refuse, run_recipe
+from dynmap_rl.utils.settings import check_at_least
+
+PACKAGE = Path(__file__).parents[2] / "dynmap_rl"
+
+
+@dataclass(frozen=True)
+class Group:
+    updates: int = 5
+    rate: float = 0.1
+
+    def __post_init__(self):
+        check_at_least(self, 1, "updates")
+
+
+@dataclass(frozen=True)
+class Settings:
+    steps: int = 3
+    dry_run: bool = False
+    output: Path | None = None
+    first: Group = Group()
+    second: Group = Group(rate=0.5)
+
+
+@pytest.fixture
+def run(monkeypatch):
+    """Return a function that runs a recipe and returns the settings that it got."""
+
+    def run(*arguments, main=None):
+        monkeypatch.setattr("sys.path", [*sys.path])
+        got = []
+        run_recipe(main or got.append, Settings, ["recipes/some.py", *arguments])
+        return got[0]
+
+    return run
+
+
+@pytest.mark.parametrize("arguments", [["--dry-run"], ["--dry_run", "True"], ["--dry-run=true"]])
+def test_options_with_hyphens_and_bare_flags(run, arguments):
+    assert run(*arguments, "--steps=-4") == Settings(steps=-4, dry_run=True)
+
+
+def test_a_nested_option_leaves_the_other_defaults_of_its_group(run):
+    assert run("--second.updates", "7") == Settings(second=Group(7, 0.5))
+
+
+def test_a_file_of_settings_and_options_that_override_it(run, tmp_path):
+    (tmp_path / "small.yaml").write_text("steps: 1\noutput: here\nsecond: {updates: 2}\n")
+    expected = Settings(1, output=Path("here"), second=Group(9, 0.5))
+    assert run("--config_path", str(tmp_path / "small.yaml"), "--second.updates", "9") == expected
+
+
+@pytest.mark.parametrize("content", ["[1]", "steps: [", "stepz: 1"])
+def test_a_damaged_file_of_settings_is_one_line(run, tmp_path, capsys, content):
+    (tmp_path / "bad.yaml").write_text(content)
+    with pytest.raises(SystemExit) as end:
+        run("--config_path", str(tmp_path / "bad.yaml"))
+    error = capsys.readouterr().err
+    assert end.value.code == 2 and error.count("\n") == 1 and ("bad.yaml" in error or "stepz" in error)
+
+
+@pytest.mark.parametrize(
+    ("option", "advice"),
+    [
+        ("--step", "--steps?"),
+        ("--dry-runs", "--dry_run?"),
+        ("--updates", "--first.updates or --second.updates?"),
+        ("--first_updates", "--first.updates?"),
+        ("--bogus", "--help"),
+    ],
+)
+def test_an_unknown_option_is_refused_with_a_suggestion(run, capsys, option, advice):
+    with pytest.raises(SystemExit) as end:
+        run(option, "1")
+    error = capsys.readouterr().err
+    assert end.value.code == 2 and error.count("\n") == 1
+    assert error.startswith("error: ") and advice in error
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [
+        (["--steps", "many"], "steps"),
+        (["--first.updates", "many"], "first.updates"),
+        (["--first.updates", "0"], "Group.updates must be at least 1, got 0"),
+        (["--steps"], "--steps"),
+        (["stray"], "stray"),
+    ],
+)
+def test_a_mistake_is_one_line_that_names_the_option(run, capsys, arguments, name):
+    with pytest.raises(SystemExit) as end:
+        run(*arguments)
+    error = capsys.readouterr().err
+    assert end.value.code == 2 and error.count("\n") == 1 and name in error
+
+
+def allocate(config):
+    torch.empty(10**15)
+
+
+def hoard(config):
+    raise MemoryError
+
+
+@pytest.mark.parametrize("main", [allocate, hoard])
+def test_too_little_memory_is_one_line(run, capsys, main):
+    with pytest.raises(SystemExit) as end:
+        run(main=main)
+    assert end.value.code == 2
+    assert capsys.readouterr().err == f"error: {MEMORY}\n"
+
+
+def test_an_unexpected_error_has_its_traceback(run):
+    def main(config):
+        raise RuntimeError("mat1 and mat2 shapes cannot be multiplied")
+
+    with pytest.raises(RuntimeError, match="mat1"):
+        run(main=main)
+
+
+def test_debug_shows_the_traceback_of_an_expected_error(run):
+    def main(config):
+        raise ValueError("expected")
+
+    with pytest.raises(ValueError, match="expected"):
+        run("--debug", main=main)
+    with pytest.raises(SystemExit):
+        run(main=main)
+
+
+def test_the_command_does_not_depend_on_where_the_repository_lies():
+    argv = ["/somewhere/recipes/paper/tables.py", "--only", "a b"]
+    assert command_line(argv) == "python recipes/paper/tables.py --only 'a b'"
+
+
+def test_options_without_effect_are_refused():
+    refuse(Group(3), Group(), ["rate"], "--other")
+    with pytest.raises(ValueError, match=r"--first\.updates .* --other"):
+        refuse(Group(3), Group(), ["rate", "updates"], "--other", "first.")
+
+
+def test_seeds():
+    assert parse_seeds("0,12") == [0, 12]
+    for text in ("a", "", "1,1"):
+        with pytest.raises(ValueError, match="--seeds"):
+            parse_seeds(text)
+
+
+def test_the_library_does_not_read_the_command_line():
+    """Only a process that runs a script sets its arguments."""
+    found = {}
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Attribute) and node.attr == "argv":
+                found.setdefault(str(path.relative_to(PACKAGE)), []).append(type(node.ctx))
+            assert not (isinstance(node, ast.ImportFrom) and node.module == "sys")
+    assert found == {"utils/processes.py": [ast.Store]}
