@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pymunk
-from pymunk._chipmunk import lib
+from pymunk._chipmunk import ffi, lib
 
 Bodies = tuple[pymunk.Space, pymunk.Body, pymunk.Body]  # a space, its cart and its block
 
@@ -26,7 +26,7 @@ def run_substeps(
         worlds: space, cart and block of each world.
         before: velocity of each cart at the start, float64 ``[N, 3]`` (m/s, m/s, rad/s).
         after: velocity of each cart at the end, float64 ``[N, 3]``.
-        steps: number of substeps, at least 1.
+        steps: number of substeps.
         dt: duration of a substep (s).
 
     Returns:
@@ -34,31 +34,28 @@ def run_substeps(
     """
     middles = (np.arange(steps) + 0.5) / steps
     velocities = before[:, None] + (after - before)[:, None] * middles[:, None]  # [N, steps, 3]
-    for (space, cart, _), rows, end in zip(worlds, velocities.tolist(), after.tolist(), strict=True):
-        *first, last = rows
-        _step(space, cart, first, dt)
-        _steer(cart, last)
-        space.step(dt)  # also adds and removes what callbacks asked for
-        _steer(cart, end)
+    linear, angular = np.ascontiguousarray(velocities[..., :2]), velocities[..., 2].tolist()
+    for (space, cart, _), *speeds, end in zip(worlds, linear, angular, after.tolist(), strict=True):
+        _step(space, cart, *speeds, dt)
+        space.step(0.0)  # no time passes; adds and removes what callbacks asked for
+        x, y, cart.angular_velocity = end
+        cart.velocity = (x, y)
     return np.array([read_bodies(cart, block) for _, cart, block in worlds])
 
 
-def _step(space: pymunk.Space, cart: pymunk.Body, velocities: list[list[float]], dt: float) -> None:
+def _step(
+    space: pymunk.Space, cart: pymunk.Body, linear: np.ndarray, angular: list[float], dt: float
+) -> None:
     step, set_velocity, set_angular = lib.cpSpaceStep, lib.cpBodySetVelocity, lib.cpBodySetAngularVelocity
     c_space, c_cart = space._space, cart._body
     space._locked = True  # so that PyMunk defers what callbacks add or remove
     try:
-        for x, y, angular in velocities:
-            set_velocity(c_cart, (x, y))
-            set_angular(c_cart, angular)
+        for velocity, turn in zip(ffi.from_buffer("cpVect[]", linear), angular, strict=True):
+            set_velocity(c_cart, velocity)
+            set_angular(c_cart, turn)
             step(c_space, dt)
     finally:
         space._locked = False
-
-
-def _steer(cart: pymunk.Body, velocity: list[float]) -> None:
-    x, y, cart.angular_velocity = velocity
-    cart.velocity = (x, y)
 
 
 def read_bodies(*bodies: pymunk.Body) -> list[float]:
