@@ -129,7 +129,7 @@ LAWS = {  # with the range of sizes of random actions, in units of their limits
 }
 
 
-@pytest.mark.parametrize("examples", [4, pytest.param(90, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("examples", [4, pytest.param(90, marks=pytest.mark.stress)])
 @pytest.mark.parametrize("name", TASKS)
 @pytest.mark.parametrize("law", LAWS, ids=lambda law: law.__name__)
 def test_law(law, name, examples):
