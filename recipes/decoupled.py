@@ -14,7 +14,6 @@ from functools import partial
 from pathlib import Path
 
 from dynmap_rl.evaluation.settings import Evaluation
-
 from dynmap_rl.training.settings import PolicyTraining, WorldModelTraining
 from dynmap_rl.utils.cli import command_line, parse_seeds, refuse, run_recipe
 from dynmap_rl.utils.devices import Compute

@@ -16,7 +16,6 @@ from functools import partial
 from pathlib import Path
 
 from dynmap_rl.data.settings import Augmentation
-
 from dynmap_rl.training.settings import (
     JointTraining,
     PolicyArchitecture,
