@@ -15,12 +15,12 @@ folder of the runs shows the tables so far.
 
 import json
 import sys
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from dynmap_rl.paper.cells import TABLES, Cell, list_cells
+from dynmap_rl.paper.launch import LAUNCHERS, check_launcher, has_run, is_done, launch, run_cell
 from dynmap_rl.utils.cli import command_line, refuse, run_recipe
 from dynmap_rl.utils.settings import check_at_least
 
@@ -59,8 +59,8 @@ class Config:
 
     def __post_init__(self):
         check_at_least(self, 1, "workers", "cpus")
-        if self.launcher not in ("local", "ray"):
-            raise ValueError(f"--launcher must be local or ray, got {self.launcher!r}")
+        if self.launcher not in LAUNCHERS:
+            raise ValueError(f"--launcher must be {' or '.join(LAUNCHERS)}, got {self.launcher!r}")
         if self.print not in (None, "markdown", "json", "findings"):
             raise ValueError(f"--print must be markdown, json or findings, got {self.print!r}")
         if not set(self.table.split(",")) <= set(TABLES):
@@ -87,12 +87,21 @@ def main(config: Config) -> None:
             f"nothing to do: {len(cells)} cells are in {config.results}; choose another --results for a new grid"
         )
         return write_page(config)
+    check_launcher(config.launcher)  # recording takes minutes
     for task in {cell.task for cell in sources + todo}:  # cells must not record at the same time
         find_or_record(task)
-    failed = launch([*sources, *(cell for cell in todo if not cell.needs)], config)
-    ready = [cell for cell in todo if cell.needs and has_run(cell.needs, config)]
+    cores = config.cpus if config.launcher == "ray" else 2 if config.workers == 1 else 1
+    run = partial(
+        run_cell, recipes=RECIPES, results=config.results, runs=config.runs, threads=int(cores),
+        presets=config.presets, root=Path.cwd(),
+    )  # fmt: skip
+    start = partial(
+        launch, run=run, launcher=config.launcher, workers=config.workers, cpus=config.cpus, gpus=config.gpus
+    )
+    failed = start([*sources, *(cell for cell in todo if not cell.needs)])
+    ready = [cell for cell in todo if cell.needs and has_run(cell.needs, config.runs)]
     missing = [cell.name for cell in todo if cell.needs and cell not in ready]
-    failed += launch(ready, config) + [f"{name} needs the world model of a failed cell" for name in missing]
+    failed += start(ready) + [f"{name} needs the world model of a failed cell" for name in missing]
     write_page(config)
     if failed:
         raise ValueError("; ".join(failed))
@@ -109,87 +118,9 @@ def choose_cells(config: Config) -> tuple[list[Cell], list[Cell], list[Cell]]:
         raise ValueError(
             f"--only must be a part of a cell's name, got {config.only!r}; --dry_run lists the names"
         )
-    todo = [cell for cell in chosen if not is_done(cell, config)]
-    needed = {cell.needs for cell in todo if cell.needs and not has_run(cell.needs, config)}
+    todo = [cell for cell in chosen if not is_done(cell.name, config.results)]
+    needed = {cell.needs for cell in todo if cell.needs and not has_run(cell.needs, config.runs)}
     return chosen, todo, [cell for cell in cells if cell.name in needed and cell not in todo]
-
-
-def is_done(cell: Cell, config: Config, root: Path = Path()) -> bool:
-    """Return whether a cell has a result."""
-    return (root / config.results / f"{cell.name}.json").exists()
-
-
-def has_run(name: str, config: Config) -> bool:
-    """Return whether the run of a cell is complete."""
-    return (config.runs / name / "eval.json").exists()
-
-
-def launch(cells: list[Cell], config: Config) -> list[str]:
-    """Run cells that do not depend on each other, and return the messages of those that failed."""
-    failed = []
-    launcher = launch_ray if config.launcher == "ray" else launch_local
-    for cell, message in launcher(cells, config) if cells else ():
-        if message:
-            failed.append(message)
-        else:
-            print(f"done: {cell.name}", flush=True)
-    return failed
-
-
-def launch_local(cells: list[Cell], config: Config) -> Iterator[tuple[Cell, str | None]]:
-    """Run every cell in a process of its own, and yield cells with their messages in the order in which they end."""
-    with ThreadPoolExecutor(config.workers) as pool:  # threads that wait for processes
-        try:
-            running = {pool.submit(run_cell, cell, config, Path.cwd()): cell for cell in cells}
-            for future in as_completed(running):
-                yield running[future], future.result()
-        except BaseException:  # Ctrl-C reaches the running cells too; no other may begin
-            pool.shutdown(cancel_futures=True)
-            raise
-
-
-def launch_ray(cells: list[Cell], config: Config) -> Iterator[tuple[Cell, str | None]]:
-    """Run every cell on a Ray cluster, and yield cells with their messages in the order in which they end.
-
-    Raises:
-        ValueError: Ray is not installed.
-    """
-    try:
-        import ray
-    except ImportError as error:
-        raise ValueError("--launcher ray needs Ray: pip install '.[ray]'") from error
-    if not ray.is_initialized():
-        ray.init(log_to_driver=False)
-    remote = ray.remote(num_cpus=config.cpus, num_gpus=config.gpus, max_retries=0)(run_cell)
-    running = {remote.remote(cell, config, Path.cwd()): cell for cell in cells}
-    while running:
-        (done,), _ = ray.wait(list(running))
-        cell = running.pop(done)
-        try:
-            yield cell, ray.get(done)
-        except ray.exceptions.RayError as error:
-            yield cell, f"{cell.name} was lost by Ray ({type(error).__name__}); the same command resumes"
-
-
-def run_cell(cell: Cell, config: Config, root: Path) -> str | None:
-    """Run the recipe of a cell in ``root`` and keep its ``eval.json``; return a message if the run failed."""
-    from dynmap_rl.utils.files import read_json, write_json
-    from dynmap_rl.utils.processes import run_script
-
-    folder, log = config.runs / cell.name, root / config.runs / f"{cell.name}.log"
-    cores = config.cpus if config.launcher == "ray" else 2 if config.workers == 1 else 1
-    arguments = [*cell.arguments, "--run", str(folder), "--compute.threads", str(int(cores))]
-    if cell.needs:
-        arguments += ["--pretrained", str(config.runs / cell.needs)]
-    if config.presets and (preset := root / config.presets / f"{cell.recipe}.yaml").exists():
-        arguments += ["--config_path", str(preset)]
-    log.parent.mkdir(parents=True, exist_ok=True)
-    if run_script(RECIPES / f"{cell.recipe}.py", arguments, root, log):
-        last = (log.read_text(errors="replace").splitlines() or ["no output"])[-1]
-        return f"{cell.name} failed; see {config.runs / cell.name}.log, which ends with: {last}"
-    if not is_done(cell, config, root):
-        write_json(root / config.results / f"{cell.name}.json", read_json(root / folder / "eval.json"))
-    return None
 
 
 def print_cells(cells: list[Cell], todo: list[Cell], sources: list[Cell]) -> None:

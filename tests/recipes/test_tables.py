@@ -80,7 +80,7 @@ def fake_script(calls):
 def calls(monkeypatch, recordings, tmp_path):
     """Calls of the cells' recipes, which are not run."""
     calls = []
-    monkeypatch.setattr("dynmap_rl.utils.processes.run_script", fake_script(calls))
+    monkeypatch.setattr("dynmap_rl.paper.launch.run_script", fake_script(calls))
     monkeypatch.setattr("dynmap_rl.training.dataset.find_or_record", lambda task, dataset=None: None)
     return calls
 
