@@ -33,7 +33,8 @@ def save_gif(pixels: torch.Tensor, path: Path, columns: int = 4, scale: int = 3)
     grid = np.concatenate([frames, blank], 1).reshape(steps, rows, columns, height, width, 3)
     grid = grid.swapaxes(2, 3).reshape(steps, rows * height, columns * width, 3)
     size = columns * width * scale, rows * height * scale
-    images = [Image.fromarray(f).resize(size, Image.Resampling.NEAREST) for f in grid]
+    images = [Image.fromarray(f).convert("P", palette=Image.Palette.ADAPTIVE) for f in grid]  # small: quick
+    images = [image.resize(size, Image.Resampling.NEAREST) for image in images]
     path.parent.mkdir(parents=True, exist_ok=True)
     images[0].save(path, save_all=True, append_images=images[1:], duration=50, loop=0, optimize=True)
 

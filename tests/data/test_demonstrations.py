@@ -134,6 +134,11 @@ def other_size(root):
     change_info(root, lambda info: info["features"][CAMERA].update(shape=[96, 96, 3]))
 
 
+def other_dynamics(root):
+    """Change the dynamics to two entries, as those of a tracked point."""
+    change_info(root, lambda info: info["features"]["dynamics.velocity"].update(shape=[2]))
+
+
 def truncated(root):
     path = next((root / "data").rglob("*.parquet"))
     path.write_bytes(path.read_bytes()[:-100])
@@ -208,6 +213,7 @@ def blank(height, width, kind=".png"):
         (no_dynamics, "dynamics.velocity"),
         (video, "must be image, got video"),
         (other_size, r"got \(96, 96, 3\)"),
+        (other_dynamics, r"shape \(6,\), got \(2,\).*recipes/robot.py"),
         (truncated, "damaged or unfinished data file"),
         (missing_file, "must have 720 frames, got 480"),
         (no_files, "must have 720 frames, got 0"),

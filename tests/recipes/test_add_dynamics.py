@@ -166,15 +166,9 @@ def test_derived_dynamics_of_our_recordings_are_near_the_simulators(recording, t
     assert torch.equal(truth["pixels"], derived["pixels"])
 
 
-def test_dynamics_of_another_size_are_of_no_task(recording, tmp_path):
-    main(Config(dataset=str(recording), output=tmp_path / "tracked", track=True, replace=True))
-    result = run(tmp_path, "decoupled", "--dataset", tmp_path / "tracked", "--run", tmp_path / "run")
-    assert result.returncode == 2 and "recipes/robot.py" in result.stderr
-
-
-def test_positions_from_the_frames(pair, tmp_path):
-    main(Config(dataset=str(pair[0]), output=tmp_path / "tracked", track=True))
-    position, state = read(tmp_path / "tracked", "dynamics.position"), read(pair[0], "observation.state")
+def test_positions_from_the_frames(videos, tmp_path):
+    main(Config(dataset=str(videos[0]), output=tmp_path / "tracked", track=True))
+    position, state = read(tmp_path / "tracked", "dynamics.position"), read(videos[0], "observation.state")
     assert open_with_lerobot(tmp_path / "tracked").meta.features["dynamics.position"]["names"] == ["x", "y"]
     error = np.abs(position - (state[:, :2] * [128, 96] - 0.5))
     assert np.median(error) < 1.5 and error.mean() < 4, "pixels; the place that is background is not found"

@@ -4,7 +4,7 @@ import json
 import shutil
 
 import pytest
-from commands import PRESETS, place_recordings, run, run_small
+from commands import PRESETS, run, run_small
 
 from dynmap_rl.utils.files import read_json, write_json
 
@@ -13,12 +13,11 @@ WEIGHTS = "world_model/weights.safetensors"
 
 
 @pytest.fixture(scope="module")
-def small(tmp_path_factory, small_run, recordings):
+def small(tmp_path_factory, small_run):
     """Return a folder with a finished run, and its output."""
     folder = shutil.copytree(
         small_run, tmp_path_factory.mktemp("decoupled"), dirs_exist_ok=True, symlinks=True
     )
-    place_recordings(folder, recordings, "bin_dropping")
     return folder, (small_run / "printed.txt").read_text()
 
 

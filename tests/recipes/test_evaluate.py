@@ -16,7 +16,7 @@ from recipes.evaluate import Config, main
 ONE_THREAD = "--compute.threads", "1"
 
 
-def test_task_1s_expert_meets_the_obstacle_of_task_2(tmp_path):
+def test_task_1s_expert_meets_the_obstacle_of_task_2(tmp_path, monkeypatch):
     """Named by its task or by its folder: it sees the state of the task that it was trained on."""
     arguments = [
         "--task",
@@ -37,6 +37,7 @@ def test_task_1s_expert_meets_the_obstacle_of_task_2(tmp_path):
     page = (tmp_path / "runs/evaluate" / name / "report.html").read_text()
     assert f"{rates['touched']:5.1f} %" in page and "data:image/gif" in page and "validation" in page
 
+    monkeypatch.setattr("dynmap_rl.reporting.media.film", lambda *arguments, **options: None)
     folder, output = str(CHECKPOINTS / "balance_reaching"), tmp_path / "by_folder.json"
     task = "balance_reaching_obstacle"
     main(

@@ -15,6 +15,7 @@ def place(recordings, tmp_path):
     return tmp_path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("recipe", "name", "row", "paper"),
     [

@@ -37,6 +37,7 @@ def finished(tmp_path_factory, world_model):
     return folder, run_small(folder, "latent_ppo", "--pretrained", world_model, "--run", "run")
 
 
+@pytest.mark.slow
 def test_a_run_compares_both(finished, world_model):
     folder, printed = finished
     result = read_json(folder / "run/eval.json")

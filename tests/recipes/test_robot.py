@@ -28,9 +28,9 @@ UNDO = [  # sizes of the preset that have no effect in joint training
 SIZES = ["--joint.updates=4", "--joint.windows=2", "--joint.window_steps=6", "--joint.rgb_steps=2"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("method", "arguments", "goal"),
-    [("decoupled", [], 0), pytest.param("joint", JOINT + UNDO + SIZES, 2, marks=pytest.mark.slow)],
+    ("method", "arguments", "goal"), [("decoupled", [], 0), ("joint", JOINT + UNDO + SIZES, 2)]
 )
 def test_a_run_measures_held_out_errors(datasets, tmp_path, method, arguments, goal):
     arguments = "--dataset", datasets / "gliding", *arguments
