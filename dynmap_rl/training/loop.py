@@ -18,7 +18,6 @@ from dynmap_rl.modules.precision import mixed_precision
 from dynmap_rl.runs.folder import load_training_state, save_training_state, truncate_metrics
 from dynmap_rl.runs.loggers import log_metrics
 
-from .parallel import differentiate, map_in_threads, split_batch
 from .settings import EndToEndTraining, WorldModelTraining
 
 ADVICE = "the last saved state is kept; run again with a lower learning rate, in another --run"
@@ -40,8 +39,7 @@ def fit(
 
     Args:
         model: all that is trained, changed in place.
-        make_loss: function that makes the loss module of a part of the batch, from the generator of its own (see
-            :mod:`dynmap_rl.training.parallel`).
+        make_loss: function that makes the loss module from the generator of its random numbers.
         episodes: training episodes ``[E, T]``.
         held_out: metrics to log beside the losses.
         folder: run folder; gets ``metrics.jsonl`` and the training state.
@@ -57,48 +55,40 @@ def fit(
     device = next(model.parameters()).device
     model.to(memory_format=torch.channels_last)  # with bfloat16 six times faster on a CPU
     optimizer = make_optimizer(model, settings.learning_rate, weight_decay=1e-4)
-    parameters = [p for group in optimizer.param_groups for p in group["params"]]
     episodes = episodes.select("pixels", "action", "goal", "dynamics", "disturbed", strict=False).to(device)
-    sizes = split_batch(settings.windows, device)
-    generators = [torch.Generator(device).manual_seed(1000 * seed + part) for part in range(len(sizes))]
-    loss_modules = [make_loss(generator) for generator in generators]
-
-    def find_losses(part: int) -> dict[str, torch.Tensor]:
-        windows = sample_windows(episodes, sizes[part], settings.window_steps, generators[part])
-        windows = change_windows(windows, settings.augmentation, generators[part])
-        with mixed_precision(device):
-            losses = loss_modules[part](windows)
-        return {name: value * (sizes[part] / settings.windows) for name, value in losses.items()}
-
+    generator = torch.Generator(device).manual_seed(1000 * seed)
+    loss_module = make_loss(generator)
     start, first, path = 0, None, folder / "checkpoint" / "world_model.pt"
     if state := load_training_state(path):
         model.load_state_dict(state["model"])
         optimizer.load_state_dict(state["optimizer"])
         start, first = state["update"], state["first_loss"]
-        _restore(generators, state["generators"], start)
+        _restore(generator, state["generator"], start)
     truncate_metrics(folder, start)
     progress = tqdm(range(start, settings.updates), folder.name, settings.updates, initial=start)
-    with map_in_threads(len(sizes)) as map_parts:
-        for update in progress:
-            set_learning_rate(optimizer, settings.learning_rate, update, settings.updates)
-            losses = differentiate(find_losses, range(len(sizes)), parameters, map_parts)
-            norm = descend(optimizer)
-            done = update + 1
-            saved = done % save_every == 0 or done == settings.updates
-            if saved or done % 50 == 0 or done == 1:
-                losses = {name: value.item() for name, value in losses.items()}
-                first = check_loss(sum(losses.values()), norm, first)
-                progress.set_postfix({k.removeprefix("loss_"): f"{v:.3f}" for k, v in losses.items()})
-            if saved:
-                log_metrics(folder, done, logger, **losses, **held_out())
-                save_training_state(
-                    path,
-                    model=model.state_dict(),
-                    optimizer=optimizer.state_dict(),
-                    generators=[generator.get_state() for generator in generators],
-                    update=done,
-                    first_loss=first,
-                )
+    for update in progress:
+        set_learning_rate(optimizer, settings.learning_rate, update, settings.updates)
+        windows = sample_windows(episodes, settings.windows, settings.window_steps, generator)
+        windows = change_windows(windows, settings.augmentation, generator)
+        with mixed_precision(device):
+            losses = loss_module(windows)
+        norm = step(sum(losses.values()), optimizer)
+        done = update + 1
+        saved = done % save_every == 0 or done == settings.updates
+        if saved or done % 50 == 0 or done == 1:
+            losses = {name: value.item() for name, value in losses.items()}
+            first = check_loss(sum(losses.values()), norm, first)
+            progress.set_postfix({k.removeprefix("loss_"): f"{v:.3f}" for k, v in losses.items()})
+        if saved:
+            log_metrics(folder, done, logger, **losses, **held_out())
+            save_training_state(
+                path,
+                model=model.state_dict(),
+                optimizer=optimizer.state_dict(),
+                generator=generator.get_state(),
+                update=done,
+                first_loss=first,
+            )
 
 
 def change_windows(
@@ -112,14 +102,12 @@ def change_windows(
     return windows
 
 
-def _restore(generators: list[torch.Generator], states: list[torch.Tensor], update: int) -> None:
-    """Restore generators, or seed them anew where the states are of another kind of device."""
-    shapes = [generator.get_state().shape for generator in generators]
-    for part, generator in enumerate(generators):
-        if [state.shape for state in states] == shapes:
-            generator.set_state(states[part])
-        else:
-            generator.manual_seed(generator.initial_seed() + 1_000_000 * update)
+def _restore(generator: torch.Generator, state: torch.Tensor, update: int) -> None:
+    """Restore a generator, or seed it anew where the state is of another kind of device."""
+    if generator.get_state().shape == state.shape:
+        generator.set_state(state)
+    else:
+        generator.manual_seed(generator.initial_seed() + 1_000_000 * update)
 
 
 def make_optimizer(module: nn.Module, learning_rate: float, weight_decay: float) -> torch.optim.Optimizer:
@@ -140,11 +128,6 @@ def step(loss: torch.Tensor, optimizer) -> torch.Tensor:
     """Take one optimiser step with clipped gradients and return their norm, without waiting for a GPU."""
     optimizer.zero_grad()
     loss.backward()
-    return descend(optimizer)
-
-
-def descend(optimizer) -> torch.Tensor:
-    """Take one optimiser step along gradients that are already computed; return their norm."""
     norm = nn.utils.clip_grad_norm_([p for g in optimizer.param_groups for p in g["params"]], 1.0)
     optimizer.step()
     return norm

@@ -16,8 +16,7 @@ from dynmap_rl.modules.checkpoints import make_policy, make_world_model
 from dynmap_rl.modules.precision import mixed_precision
 from dynmap_rl.modules.world_model import WorldModel
 from dynmap_rl.objectives.world_model import WorldModelLoss, rms
-from dynmap_rl.training.loop import descend, make_optimizer
-from dynmap_rl.training.parallel import differentiate, map_in_threads, split_batch
+from dynmap_rl.training.loop import make_optimizer, step
 
 SUPERVISION = ("position", "velocity")
 
@@ -32,22 +31,15 @@ def world_model_training(
     constants = load_meta(dataset)["normalization"]
     windows = sample_windows(episodes, count, steps, torch.Generator().manual_seed(0))
     fast = make_world_model(constants, SUPERVISION).to(memory_format=torch.channels_last)
-    sizes = split_batch(count, torch.device("cpu"))
-    halves = windows.split(sizes)
-    loss_modules = [WorldModelLoss(fast, rgb_steps=8, generator=torch.Generator()) for _ in sizes]
+    loss_module = WorldModelLoss(fast, rgb_steps=8, generator=torch.Generator())
     optimizer = make_optimizer(fast, 1e-4, 1e-4)
-
-    def find_losses(part: int) -> dict[str, torch.Tensor]:
-        with mixed_precision("cpu"):
-            losses = loss_modules[part](halves[part])
-        return {name: value * (sizes[part] / count) for name, value in losses.items()}
 
     def ours():
         def run():
-            with map_in_threads(len(sizes)) as map_parts:
-                for _ in range(updates):
-                    differentiate(find_losses, range(len(sizes)), list(fast.parameters()), map_parts)
-                    descend(optimizer)
+            for _ in range(updates):
+                with mixed_precision("cpu"):
+                    losses = loss_module(windows)
+                step(sum(losses.values()), optimizer)
 
         return updates * count * steps / seconds(run)
 
