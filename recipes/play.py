@@ -148,7 +148,8 @@ def save_film(frames: list, path: Path) -> None:
     images = [Image.fromarray(frame) for frame in frames[::2]]
     images = [image.resize((image.width // 2, image.height // 2)) for image in images]
     some = np.concatenate([np.asarray(image) for image in images[:: len(images) // 16 + 1]])
-    colors = Image.fromarray(some).quantize(128)
+    # The median cut, which is the default, has no colour left for few pixels such as the goal's.
+    colors = Image.fromarray(some).quantize(128, Image.Quantize.FASTOCTREE)
     images = [image.quantize(palette=colors, dither=Image.Dither.NONE) for image in images]
     path.parent.mkdir(parents=True, exist_ok=True)
     images[0].save(path, save_all=True, append_images=images[1:], duration=100, loop=0)
