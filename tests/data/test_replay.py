@@ -82,7 +82,7 @@ def test_torchrls_own_buffer_and_losses_take_loaded_episodes(recording):
     sampler = SliceSampler(slice_len=10)
     sample = TensorDictReplayBuffer(storage=rows, sampler=sampler, batch_size=200, transform=follow).sample()
     sample = sample[sample["next", "agent_pos"].isfinite().all(-1)]  # without the ends of the slices
-    assert len(sample) == 180
+    assert 180 <= len(sample) < 200  # a slice may happen to begin where the one before it ends
     place = sample["episode"], sample["step_count"][:, 0] + 1
     for key in observed:
         expected = episodes[key][place]
