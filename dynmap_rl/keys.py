@@ -3,9 +3,9 @@
 DYNAMICS = ("position", "velocity", "acceleration")  # quantities of every rigid body, in the paper's order
 
 GYMNASIUM_IDS = {  # by task
-    "balance_reaching": "dynmap_rl/BalanceReaching-v0",
-    "balance_reaching_obstacle": "dynmap_rl/BalanceReachingObstacle-v0",
-    "bin_dropping": "dynmap_rl/BinDropping-v0",
+    "balance_reaching": "dynmap_rl/BalanceReaching-v1",
+    "balance_reaching_obstacle": "dynmap_rl/BalanceReachingObstacle-v1",
+    "bin_dropping": "dynmap_rl/BinDropping-v1",
 }
 
 CAMERA = "observation.images.front"  # LeRobot column of the frames
@@ -20,4 +20,5 @@ OPTIONAL = {  # columns that a dataset may lack, likewise
     ("next", "reward"): "next.reward",
     ("next", "is_success"): "next.success",
     "disturbed": "disturbed",
+    "expert_action": "expert_action",
 }

@@ -4,6 +4,7 @@
     python recipes/evaluate.py --policy runs/decoupled/balance_reaching/position_velocity_recurrent
     python recipes/evaluate.py --policy runs/act/checkpoints/last/pretrained_model   # any LeRobot policy
     python recipes/evaluate.py --expert balance_reaching --task balance_reaching_obstacle
+    python recipes/evaluate.py --expert careless                                     # ignores the block
 
 A policy acts on frames in closed loop; the result is drop rate, position error and success rate. An expert acts on
 states; the result is the rates of success, drops and touches, and for task 2 how often the straight path to the goal is
@@ -33,7 +34,8 @@ class Config:
     # Task: balance_reaching, balance_reaching_obstacle, bin_dropping, or module:Class of your own; by default that of
     # the run, otherwise balance_reaching.
     task: str | None = None
-    # Expert: the task that a shipped expert belongs to, or a folder of checkpoints; by default the task's own expert.
+    # Expert: the task that a shipped expert belongs to, a folder of checkpoints, or careless, a baseline that ignores the
+    # block; by default the task's own expert.
     expert: str | None = None
     # Checkpoint of the expert; by default the last.
     checkpoint: str | None = None
@@ -126,13 +128,17 @@ def judge_expert(config: Config) -> tuple[Path, str, dict]:
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.evaluation.rollout import failures_first, scene_seeds
     from dynmap_rl.evaluation.statistics import wilson
+    from dynmap_rl.experts.careless import CarelessController
     from dynmap_rl.experts.network import list_checkpoints, load_expert, roll_out, task_of_expert
     from dynmap_rl.reporting.media import film
 
     task = get_task(config.task or "balance_reaching")
     expert = config.expert or task.name
-    checkpoint = config.checkpoint or list_checkpoints(expert)[-1]
-    network, trained_on = load_expert(expert, checkpoint), task_of_expert(expert, task)
+    if expert == "careless":
+        checkpoint, network, trained_on = "baseline", CarelessController(task), task
+    else:
+        checkpoint = config.checkpoint or list_checkpoints(expert)[-1]
+        network, trained_on = load_expert(expert, checkpoint), task_of_expert(expert, task)
     seeds = scene_seeds(config.eval.split, config.eval.episodes)
     outcomes = list_outcomes(task, roll_out(network, task, seeds, states=trained_on))
     rates = {name: 100 * sum(values) / len(seeds) for name, values in outcomes.items()}

@@ -49,7 +49,9 @@ def augment(
     offset[:, 0, 0] += mirrored  # 1 - x
     windows = windows.exclude("agent_pos", "state")
     windows["pixels"] = _transform_pixels(windows["pixels"], mirrored, shift, channels)
-    windows["action"] = windows["action"] * sign
+    for key in ("action", "expert_action"):
+        if key in windows:
+            windows[key] = windows[key] * sign
     windows["goal"] = windows["goal"] * sign[..., :2] + offset[..., :2]
     dynamics = windows["dynamics"].apply(lambda x: x * sign.repeat(1, 1, 2))
     windows["dynamics"] = dynamics.set("position", dynamics["position"] + offset.repeat(1, 1, 2))

@@ -30,7 +30,7 @@ from .format.reading import (
 )
 from .normalization import normalization_constants
 
-FORMAT = 3  # version of what is recorded, and how
+FORMAT = 4  # version of what is recorded, and how
 META = "meta/dynmap.json"
 RANGE = {"low": [Real], "high": [Real]}
 META_FORM = {
@@ -42,7 +42,7 @@ META_FORM = {
     "episodes": [{"episode_index": int}],
 }
 SIZES = {"observation.state": 5, "action": 3, **{NEEDED[key]: 6 for key in NEEDED if "dynamics" in key}}
-SIZES |= dict.fromkeys(OPTIONAL.values(), 1)
+SIZES |= dict.fromkeys(OPTIONAL.values(), 1) | {"expert_action": 3}
 
 
 def load_dataset(dataset: str | Path, split: str | None = None) -> TensorDict:
@@ -66,6 +66,8 @@ def load_dataset(dataset: str | Path, split: str | None = None) -> TensorDict:
         - ``pixels`` uint8 ``[E, T, 3, 64, 64]``, ``agent_pos`` ``[E, T, 5]``, ``goal`` ``[E, T, 2]`` (the last two
           entries of ``agent_pos``), ``action`` ``[E, T, 3]``
         - ``("dynamics", "position" | "velocity" | "acceleration")`` ``[E, T, 6]``
+        - ``expert_action`` ``[E, T, 3]``, where the dataset has it: what the expert would have done, without noise and
+          pushes; imitation learns it
         - ``disturbed`` ``[E, T, 1]``: a push acted in the place of the expert; false without such a column
         - ``("next", "reward" | "is_success")`` ``[E, T, 1]``, where the dataset has the columns ``next.reward`` and
           ``next.success``

@@ -7,6 +7,7 @@ from tensordict import TensorDict, TensorDictBase
 from tqdm import tqdm
 
 from dynmap_rl.modules.world_model import WorldModel
+from dynmap_rl.objectives.imitation import find_target
 
 from .augmentation import augment
 
@@ -24,19 +25,21 @@ def compute_features(
 
     Args:
         world_model: frozen world model; the result is on its device.
-        episodes: ``[E, T]`` with ``pixels``, ``action``, ``goal``, ``dynamics`` and, optional, ``disturbed``.
+        episodes: ``[E, T]`` with ``pixels``, ``action``, ``goal``, ``dynamics`` and, optional, ``expert_action`` and ``disturbed``.
         copies: number of further versions of every episode, each from a random step on.
         generator: source of the random numbers of the copies, on the device of the world model.
         batch: number of episodes computed at a time.
         recolor: permute the colour channels of the copies.
 
     Returns:
-        ``[(1 + copies) E, T]`` with ``latent``, ``hidden1``, ``hidden2``, ``action``, ``goal``, and ``disturbed`` bool
-        ``[..., 1]``: steps that imitation leaves out, because a push acted or the episode was over.
+        ``[(1 + copies) E, T]`` with ``latent``, ``hidden1``, ``hidden2``, ``goal``, the ``action`` to imitate, and
+        ``disturbed`` bool ``[..., 1]``: steps that imitation leaves out (see
+        :func:`dynmap_rl.objectives.imitation.find_target`), also where the episode was over.
     """
     device = next(world_model.parameters()).device
-    if "disturbed" not in episodes:
-        episodes = episodes.copy().set("disturbed", torch.zeros(*episodes.shape, 1, dtype=torch.bool))
+    target, ignore = find_target(episodes)
+    ignore = torch.zeros(*episodes.shape, 1, dtype=torch.bool) if ignore is None else ignore
+    episodes = episodes.copy().set("expert_action", target).set("disturbed", ignore)
     parts = []
     for copy in range(copies + 1):
         for chunk in tqdm(episodes.split(batch), f"states {copy + 1}/{copies + 1}", leave=False):
@@ -49,9 +52,8 @@ def compute_features(
             latent = world_model.encode(chunk["pixels"], mixed=True)
             _, hidden1, hidden2 = world_model.predict(latent, chunk["action"])
             features = {"latent": latent, "hidden1": hidden1, "hidden2": hidden2}
-            parts.append(
-                TensorDict(features, chunk.shape).update(chunk.select("action", "goal", "disturbed"))
-            )
+            chunk = chunk.select("expert_action", "goal", "disturbed").rename_key_("expert_action", "action")
+            parts.append(TensorDict(features, chunk.shape).update(chunk))
     return torch.cat(parts)
 
 

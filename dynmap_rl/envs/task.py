@@ -13,6 +13,7 @@ from .scene import GOAL_COLOR, Color, Scene, SceneRanges, sample_scene
 from .world import ACCELERATION_LIMIT, VELOCITY_LIMIT, World
 
 MARKER_SIZE = 0.04  # m
+ROCKING = 0.05  # rad, tilt of a block on the cart from which on the penalty is full
 SPEEDS, ACCELERATIONS = VELOCITY_LIMIT.tolist(), ACCELERATION_LIMIT.tolist()
 X_SPEED, Y_SPEED, SPIN = SPEEDS
 
@@ -130,8 +131,10 @@ def distance_reward(distance: float) -> float:
 
 
 def effort(world: World) -> float:
-    """Return the penalty on acceleration and tilt of the cart, 0 to 0.16."""
-    return 0.02 * squared_share(world.acceleration, ACCELERATIONS) + 0.1 * min(abs(world.position[2]), 1.0)
+    """Return the penalty on acceleration and tilt of the cart and on a rocking block, 0 to 0.78."""
+    rocking = min(abs(world.block_in_cart[2]) / ROCKING, 1.0)
+    share = squared_share(world.acceleration, ACCELERATIONS)
+    return 0.06 * share + 0.1 * min(abs(world.position[2]), 1.0) + 0.5 * rocking
 
 
 def squared_share(dynamics: np.ndarray, limits: Sequence[float]) -> float:

@@ -43,6 +43,7 @@ from .world import CONTROL_DT, EPISODE_STEPS, World
 
 SUCCESS_DISTANCE = 0.05  # m, about 3 pixels
 REST_SPEED = 0.02  # m/s
+FAILURE = -20.0  # reward of a failure; less, and PPO's experts trade drops for speed
 
 
 def has_arrived(world: World) -> bool:
@@ -55,8 +56,8 @@ class BalanceReaching(Task):
 
     State: ``[16]``, see :func:`dynmap_rl.envs.task.base_state`.
 
-    Reward, -0.2 to 1 a step: ``0.4 exp(-4 d) + 0.6 exp(-25 d)`` for a goal distance d (m), minus small penalties on
-    acceleration and tilt of the cart; 0 once the block is dropped.
+    Reward, -0.8 to 1 a step: ``0.4 exp(-4 d) + 0.6 exp(-25 d)`` for a goal distance d (m), minus small penalties on
+    acceleration and tilt of the cart and on a rocking block; -20 once the block is dropped.
 
     End: the block is dropped.
 
@@ -70,7 +71,7 @@ class BalanceReaching(Task):
 
     def reward(self, world: World) -> float:
         if world.dropped:
-            return 0.0
+            return FAILURE
         return distance_reward(world.goal_distance) - effort(world)
 
     def is_success(self, world: World) -> bool:
@@ -85,8 +86,8 @@ class BalanceReachingObstacle(Task):
     State: ``[20]``, the 16 entries of task 1, where the next point of the shortest way around the obstacle takes the
     place of the goal; then the middle of the obstacle relative to the cart (2), its length, and the length of the way.
 
-    Reward, about -1 to 1 a step: that of task 1, where the goal distance d (m) is the length of the shortest way
-    around the obstacle, plus 5 for each metre by which the step shortened the way; -1 once the block is dropped or the
+    Reward, about -1 to 1.3 a step: that of task 1, where the goal distance d (m) is the length of the shortest way
+    around the obstacle, plus 5 for each metre by which the step shortened the way; -20 once the block is dropped or the
     obstacle touched.
 
     End: the block is dropped, or cart or block touched the obstacle.
@@ -126,7 +127,7 @@ class BalanceReachingObstacle(Task):
 
     def reward(self, world: World) -> float:
         if self.is_over(world):
-            return -1.0
+            return FAILURE
         before, now = (world.commanded - world.action)[:2].tolist(), world.commanded[:2].tolist()
         distance = length(self.way(world, tuple(now)))
         progress = length(self.way(world, tuple(before))) - distance
@@ -149,10 +150,9 @@ class BinDropping(Task):
 
     State: ``[20]``, the 16 entries of task 1, then the goal relative to the block (2), width and depth of the bin.
 
-    Reward, -1 to 1 a step: with the block in the bin 1, minus small penalties on the cart's speed and tilt; before
+    Reward, -5 to 1 a step: with the block in the bin 1, minus small penalties on the cart's speed and tilt; before
     that ``0.2 exp(-4 d)`` for a distance d (m) from block to goal; in both cases minus a small penalty on the cart's
-    acceleration; -1 once the block missed the bin or the cart touched it. The paper's reward has the 1 and the -1
-    alone.
+    acceleration; -5 once the block missed the bin or the cart touched it. The paper's reward has a 1 and a -1 alone.
 
     End: the block fell below the bin's floor beside it, or the cart touched the bin.
 
@@ -177,7 +177,7 @@ class BinDropping(Task):
 
     def reward(self, world: World) -> float:
         if self.is_over(world):
-            return -1.0
+            return FAILURE / 4
         acceleration = squared_share(world.acceleration, ACCELERATIONS)
         if self.is_in_bin(world):
             motion = squared_share(world.velocity, SPEEDS)

@@ -21,8 +21,8 @@ EPISODE_STEPS = 120
 FINAL_STEPS = 10  # over which the position error is a mean
 
 # Limits of the cart per axis (x, y, theta), the same for experts and policies.
-VELOCITY_LIMIT = np.array([0.4, 0.4, 1.0])  # m/s, m/s, rad/s
-ACCELERATION_LIMIT = np.array([3.0, 3.0, 10.0])  # m/s^2, m/s^2, rad/s^2
+VELOCITY_LIMIT = np.array([0.8, 0.8, 2.0])  # m/s, m/s, rad/s
+ACCELERATION_LIMIT = np.array([6.0, 6.0, 20.0])  # m/s^2, m/s^2, rad/s^2
 WORKSPACE_LOW = np.array([0.05, 0.03, -math.pi / 3])  # m, m, rad
 WORKSPACE_HIGH = np.array([0.95, 0.95, math.pi / 3])
 ACTION_LIMIT = VELOCITY_LIMIT * CONTROL_DT  # the largest change of the commanded pose in one control step
@@ -187,8 +187,7 @@ def step_worlds(worlds: Sequence[World], actions: Sequence[np.ndarray]) -> None:
         ValueError: an action is not 3 finite numbers.
     """
     last = np.array([world.action for world in worlds])
-    limited = _limit(actions, last, np.array([world.commanded for world in worlds]))
-    limited = limited.astype(np.float32).astype(np.float64)  # as stored, so that a replay is bit-exact
+    limited = limit_actions(worlds, actions)
     found = simulate(worlds, last / CONTROL_DT, limited / CONTROL_DT)
     for world, action, bodies in zip(worlds, limited, found, strict=True):
         world._finish(action, bodies)
@@ -215,8 +214,21 @@ HALF_BRAKE, TWICE = ACCELERATION_LIMIT * CONTROL_DT / 2, 2 * ACCELERATION_LIMIT
 HALF_SQUARED = HALF_BRAKE**2
 
 
-def _limit(actions: Sequence[np.ndarray], last: np.ndarray, commanded: np.ndarray) -> np.ndarray:
-    """Return the actions ``[N, 3]`` that the carts can execute, within limits of acceleration, speed and workspace."""
+def limit_actions(worlds: Sequence[World], actions: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the actions that the carts can execute, within limits of acceleration, speed and workspace.
+
+    Args:
+        worlds: N worlds.
+        actions: one action (m, m, rad) for each world.
+
+    Returns:
+        ``[N, 3]``, rounded to float32 as they are stored, so that a replay is bit-exact.
+
+    Raises:
+        ValueError: an action is not 3 finite numbers.
+    """
+    last = np.array([world.action for world in worlds])
+    commanded = np.array([world.commanded for world in worlds])
     wanted = np.array(actions, dtype=np.float64)
     if wanted.shape != last.shape or not np.isfinite(wanted).all():
         raise ValueError(f"an action must be 3 finite numbers (dX, dY, dTheta), got {wanted}")
@@ -224,4 +236,5 @@ def _limit(actions: Sequence[np.ndarray], last: np.ndarray, commanded: np.ndarra
     speed = np.sqrt(HALF_SQUARED + TWICE * room) - HALF_BRAKE
     back, forth = np.minimum(speed, VELOCITY_LIMIT) * CONTROL_DT
     wanted = np.minimum(np.maximum(wanted, -back), forth)
-    return np.minimum(np.maximum(wanted, last - LARGEST_CHANGE), last + LARGEST_CHANGE)
+    limited = np.minimum(np.maximum(wanted, last - LARGEST_CHANGE), last + LARGEST_CHANGE)
+    return limited.astype(np.float32).astype(np.float64)

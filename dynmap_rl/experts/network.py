@@ -36,7 +36,7 @@ class ExpertNetwork(nn.Module):
         self.mlp = MLP(state_size, size, num_cells=[hidden, hidden], activation_class=nn.Tanh)
         nn.init.orthogonal_(self.mlp[-1].weight, 0.01)
         nn.init.zeros_(self.mlp[-1].bias)
-        self.log_std = nn.Parameter(torch.full((size,), -0.7))
+        self.log_std = nn.Parameter(torch.full((size,), -1.2))
         self.register_buffer("limit", torch.as_tensor(acceleration_limit, dtype=torch.float32))
 
     def forward(self, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -17,7 +17,7 @@ POLICIES = {"feedforward": FeedforwardPolicy, "recurrent": RecurrentPolicy}
 
 
 def make_world_model(
-    constants: dict, supervision: tuple[str, ...], latent_size=64, hidden_size=128, keypoints=False
+    constants: dict, supervision: tuple[str, ...], latent_size=64, hidden_size=128, architecture="attention"
 ) -> WorldModel:
     """Make a world model with random weights.
 
@@ -26,10 +26,10 @@ def make_world_model(
         supervision: quantities that are decoded.
         latent_size: Z.
         hidden_size: H.
-        keypoints: see :class:`dynmap_rl.modules.Encoder`.
+        architecture: see :class:`dynmap_rl.modules.WorldModel`.
     """
     dynamics = {q: Normalizer(**constants[q]) for q in supervision}
-    return WorldModel(Normalizer(**constants["action"]), dynamics, latent_size, hidden_size, keypoints)
+    return WorldModel(Normalizer(**constants["action"]), dynamics, latent_size, hidden_size, architecture)
 
 
 def make_policy(
@@ -65,7 +65,7 @@ def save_world_model(folder: Path, model: WorldModel) -> None:
         "dynamics": {q: n.size for q, n in model.dynamics_decoder.normalizers.items()},
         "latent_size": model.latent_size,
         "hidden_size": model.hidden_size,
-        "keypoints": model.keypoints,
+        "architecture": model.architecture,
     }
     write_json(Path(folder) / "arguments.json", arguments)
     save_weights(Path(folder) / "weights.safetensors", model)
@@ -80,6 +80,11 @@ def load_world_model(folder: Path) -> WorldModel:
     arguments = _read_arguments(folder)
     if "dynamics" not in arguments:
         raise ValueError(f"{folder} holds a policy, not a world model")
+    if arguments.pop("keypoints", False):  # of the first release, as is a folder without architecture
+        raise ValueError(
+            f"{folder} has the keypoints of the first release, which this one lacks; train it again"
+        )
+    arguments.setdefault("architecture", "plain")
 
     def make() -> WorldModel:
         dynamics = {q: _blank(size) for q, size in arguments["dynamics"].items()}

@@ -6,36 +6,11 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from .layers import BLOCK, down, same, to_blocks
+from .layers import BLOCK, ChannelNorm, down, make_grid, same, to_blocks
 
 
 class Encoder(nn.Module):
-    """Plain CNN from frames to latents.
-
-    Three convolutions on blocks of 4 x 4 pixels end in maps of 8 x 8. The frame's mean colour, which the normalisation
-    removes, reaches the latent through a linear map of its own. With ``keypoints``, a spatial softmax adds the
-    expected position of every channel of the 8 x 8 and 16 x 16 maps (Levine et al. 2016), so that the position of an
-    object reaches the latent to a fraction of a pixel.
-
-    Args:
-        latent_size: Z.
-        channels: channels of the maps of stride 4 and 8.
-        keypoints: add expected positions.
-    """
-
-    def __init__(self, latent_size: int = 64, channels: tuple[int, int] = (32, 64), keypoints: bool = False):
-        super().__init__()
-        c1, c2 = channels
-        self.stem = nn.Conv2d(3 * BLOCK**2, c1, 3, 1, 1)
-        self.top = nn.Sequential(down(c1, c2), same(c2))
-        self.keypoints = nn.ModuleList()
-        features = c2 * 64
-        if keypoints:
-            self.keypoints.extend([SpatialSoftmax(c1, 32), SpatialSoftmax(c2, 32)])
-            self.squeeze = nn.Conv2d(c2, 8, 1)
-            features = 8 * 64 + 2 * 2 * 32
-        self.project = nn.Linear(features, latent_size)
-        self.color = nn.Linear(3, latent_size, bias=False)
+    """Base of the encoders: any leading axes, and chunks where no gradient is needed."""
 
     def forward(self, pixels: torch.Tensor) -> torch.Tensor:
         """Encode frames ``[..., 3, 64, 64]`` in 0..255, uint8 or float, as latents ``[..., Z]``.
@@ -48,9 +23,33 @@ class Encoder(nn.Module):
         x = pixels.reshape(-1, 3, 64, 64)
         # Without gradients, chunks that fit into the processor's cache are twice as fast.
         chunks = (x,) if torch.is_grad_enabled() else x.split(64)
-        return torch.cat([self._encode(chunk) for chunk in chunks]).reshape(*pixels.shape[:-3], -1)
+        return torch.cat([self.encode(chunk) for chunk in chunks]).reshape(*pixels.shape[:-3], -1)
 
-    def _encode(self, x: torch.Tensor) -> torch.Tensor:
+    def encode(self, x: torch.Tensor) -> torch.Tensor:
+        """Encode frames ``[N, 3, 64, 64]`` in 0..255 as latents ``[N, Z]``."""
+        raise NotImplementedError
+
+
+class PlainEncoder(Encoder):
+    """Plain CNN (the paper's form).
+
+    Three convolutions on blocks of 4 x 4 pixels end in maps of 8 x 8. The frame's mean colour, which the normalisation
+    removes, reaches the latent through a linear map of its own.
+
+    Args:
+        latent_size: Z.
+        channels: channels of the maps of stride 4 and 8.
+    """
+
+    def __init__(self, latent_size: int = 64, channels: tuple[int, int] = (32, 64)):
+        super().__init__()
+        c1, c2 = channels
+        self.stem = nn.Conv2d(3 * BLOCK**2, c1, 3, 1, 1)
+        self.top = nn.Sequential(down(c1, c2), same(c2))
+        self.project = nn.Linear(c2 * 64, latent_size)
+        self.color = nn.Linear(3, latent_size, bias=False)
+
+    def encode(self, x: torch.Tensor) -> torch.Tensor:
         # The precision of the convolutions holds 0..255 exactly; most of the memory traffic is here.
         autocast = torch.is_autocast_enabled(x.device.type)
         dtype = torch.get_autocast_dtype(x.device.type) if autocast else self.project.weight.dtype
@@ -61,30 +60,82 @@ class Encoder(nn.Module):
         weight, bias = self.stem.weight / 255, self.stem.bias - 0.5 * self.stem.weight.sum((1, 2, 3))
         x = F.conv2d(x, weight, bias, padding=1).relu()  # (N, C, 16, 16)
         y = self.top(x)  # (N, C, 8, 8)
-        if self.keypoints:
-            points = [read(m) for read, m in zip(self.keypoints, (x, y), strict=True)]
-            features = torch.cat([self.squeeze(y).flatten(1), *points], -1)
-        else:
-            features = y.flatten(1)
-        return self.project(features) + 5 * self.color(color)  # (N, Z); mean colours differ little
+        return self.project(y.flatten(1)) + 5 * self.color(color)  # (N, Z); mean colours differ little
 
 
-class SpatialSoftmax(nn.Module):
-    """Expected positions of learned heat maps (Levine et al. 2016).
+class AttentionEncoder(Encoder):
+    """Positions, colours and features at the places that K learned attention maps look at.
+
+    Convolutions on blocks of 4 x 4 pixels, with the context of maps of 8 x 8 added, end in K attention maps of 32 x 32.
+    Each map pools its expected position (spatial softmax, Levine et al. 2016), the frame's mean colour there, and
+    learned features. So the position of an object reaches the latent to a fraction of a pixel, and its colour without
+    a detour through filters.
 
     Args:
-        channels: C of the input.
-        points: number of heat maps.
+        latent_size: Z.
+        channels: channels of the maps of stride 4 and 8.
+        maps: K.
+        features: learned features of each map.
+        width: width of the MLP from the pooled values to the latent.
     """
 
-    def __init__(self, channels: int, points: int):
+    def __init__(
+        self,
+        latent_size: int = 64,
+        channels: tuple[int, int] = (32, 48),
+        maps: int = 16,
+        features: int = 8,
+        width: int = 256,
+    ):
         super().__init__()
-        self.logits = nn.Conv2d(channels, points, 1)
+        c1, c2 = channels
+        self.maps = maps
+        self.stem = nn.Conv2d(3 * BLOCK**2, c1, 1)
+        self.mix = nn.Sequential(nn.Conv2d(c1, c1, 3, 1, 1), ChannelNorm(c1))
+        self.context = nn.Sequential(down(c1, c2), same(c2), nn.Conv2d(c2, c1, 1))
+        self.attend = nn.Conv2d(c1, SUB**2 * maps, 1)
+        self.features = nn.Conv2d(c1, features, 1)
+        pooled = maps * (2 + 3 + features) + 3
+        self.mlp = nn.Sequential(nn.Linear(pooled, width), nn.SiLU(), nn.Linear(width, latent_size))
+        self.linear = nn.Linear(pooled, latent_size)
+        # Constant products in the place of sums over strided memory, which are several times as slow.
+        self.register_buffer("places", _sub_blocks(make_grid(32)))  # (1024, 2)
+        self.register_buffer("average", _averages())  # (48, 4 * 3)
+        self.register_buffer("gather", torch.eye(maps).repeat(SUB**2, 1))  # (4 K, K)
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Map ``[N, C, H, W]`` to positions ``[N, 2 points]`` in [-1, 1]: x of all points, then y."""
-        logits = self.logits(x).float()
-        heat = F.softmax(logits.flatten(2), -1).unflatten(-1, logits.shape[2:])
-        across = torch.linspace(-1, 1, heat.shape[-1], device=heat.device)
-        down = torch.linspace(-1, 1, heat.shape[-2], device=heat.device)
-        return torch.cat([heat.sum(-2) @ across, heat.sum(-1) @ down], -1)
+    def encode(self, x: torch.Tensor) -> torch.Tensor:
+        count = len(x)
+        autocast = torch.is_autocast_enabled(x.device.type)
+        dtype = torch.get_autocast_dtype(x.device.type) if autocast else self.linear.weight.dtype
+        blocks = to_blocks(x).to(dtype) / 255 - 0.5  # (N, 48, 16, 16)
+        h = self.mix(self.stem(blocks).relu())
+        h = (h + F.interpolate(self.context(h.relu()), scale_factor=2)).relu()
+        # In channels-last memory the next lines only change the view.
+        logits = self.attend(h).permute(0, 2, 3, 1).reshape(count, -1, self.maps)  # (N, 1024, K)
+        attention = logits.float().softmax(1)
+        colors = (blocks.permute(0, 2, 3, 1).reshape(count, 256, -1).float() @ self.average).view(
+            count, -1, 3
+        )
+        values = torch.cat([self.places.expand(count, -1, -1), colors], -1)
+        where = attention.transpose(1, 2) @ (2 * values)  # (N, K, 5)
+        of_blocks = attention.view(count, 256, -1) @ self.gather  # (N, 256, K)
+        features = self.features(h).permute(0, 2, 3, 1).reshape(count, 256, -1).float()
+        what = of_blocks.transpose(1, 2) @ features  # (N, K, features)
+        pooled = torch.cat([where.flatten(1), what.flatten(1), 3 * colors.mean(1)], -1)
+        return self.mlp(pooled) + self.linear(pooled)
+
+
+SUB = 2  # attention maps have SUB x SUB places in a block
+
+
+def _sub_blocks(grid: torch.Tensor) -> torch.Tensor:
+    """Reorder values of the places of a map, ``[32, 32, C]``, block by block, ``[1024, C]``."""
+    return grid.unflatten(0, (-1, SUB)).unflatten(2, (-1, SUB)).transpose(1, 2).reshape(-1, grid.shape[-1])
+
+
+def _averages() -> torch.Tensor:
+    """Return the product from a block's 48 numbers to the mean colours of its SUB x SUB parts, ``[48, SUB**2 * 3]``."""
+    side = BLOCK // SUB
+    part = torch.arange(BLOCK) // side
+    here = F.one_hot(SUB * part[:, None] + part, SUB**2).flatten(0, 1) / side**2  # (16, SUB**2)
+    return torch.einsum("pq,cd->cpqd", here, torch.eye(3)).reshape(3 * BLOCK**2, -1)

@@ -23,6 +23,13 @@ def to_blocks(pixels: torch.Tensor) -> torch.Tensor:
     return blocks.view(torch.uint8).flatten(3).permute(0, 3, 1, 2)
 
 
+def make_grid(size: int) -> torch.Tensor:
+    """Return x and y of the middles of ``size`` x ``size`` places in -1..1, ``[size, size, 2]``."""
+    line = (torch.arange(size) + 0.5) * 2 / size - 1
+    y, x = torch.meshgrid(line, line, indexing="ij")
+    return torch.stack([x, y], -1)
+
+
 class ChannelNorm(nn.Module):
     """LayerNorm over the channels of every pixel, ``[N, C, H, W]``.
 

@@ -7,12 +7,14 @@ from collections.abc import Mapping
 import torch
 from torch import nn
 
-from .decoder import DynamicsDecoder, ImageDecoder
-from .encoder import Encoder
+from .decoder import BlobDecoder, DynamicsDecoder, PlainDecoder
+from .encoder import AttentionEncoder, PlainEncoder
 from .normalization import Normalizer
 from .precision import mixed_precision
 from .recurrent import State
 from .transition import Transition
+
+ARCHITECTURES = {"plain": (PlainEncoder, PlainDecoder), "attention": (AttentionEncoder, BlobDecoder)}
 
 
 class WorldModel(nn.Module):
@@ -23,7 +25,11 @@ class WorldModel(nn.Module):
         dynamics: normaliser of each supervised quantity: any of position, velocity, acceleration, or none.
         latent_size: Z.
         hidden_size: H.
-        keypoints: see :class:`Encoder`.
+        architecture: ``plain``, the paper's plain CNNs (:class:`PlainEncoder`, :class:`PlainDecoder`), or ``attention``
+            (:class:`AttentionEncoder`, :class:`BlobDecoder`).
+
+    Raises:
+        ValueError: the architecture is unknown.
     """
 
     def __init__(
@@ -32,13 +38,16 @@ class WorldModel(nn.Module):
         dynamics: Mapping[str, Normalizer],
         latent_size: int = 64,
         hidden_size: int = 128,
-        keypoints: bool = False,
+        architecture: str = "attention",
     ):
         super().__init__()
-        self.latent_size, self.hidden_size, self.keypoints = latent_size, hidden_size, keypoints
-        self.encoder = Encoder(latent_size, keypoints=keypoints)
+        if architecture not in ARCHITECTURES:
+            raise ValueError(f"architecture must be one of {', '.join(ARCHITECTURES)}, got {architecture!r}")
+        self.latent_size, self.hidden_size, self.architecture = latent_size, hidden_size, architecture
+        encoder, decoder = ARCHITECTURES[architecture]
+        self.encoder = encoder(latent_size)
         self.transition = Transition(action, latent_size, hidden_size)
-        self.image_decoder = ImageDecoder(latent_size + 2 * hidden_size)
+        self.image_decoder = decoder(latent_size + 2 * hidden_size)
         self.dynamics_decoder = DynamicsDecoder(latent_size + 2 * hidden_size, dynamics)
 
     @property

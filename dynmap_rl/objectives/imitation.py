@@ -44,29 +44,39 @@ def imitation_loss(
     return (error * weight).sum() / weight.sum().clamp_min(1)
 
 
-def find_ignored(
-    tensordict: TensorDictBase, disturbed: NestedKey, masks: tuple[NestedKey, ...]
-) -> torch.Tensor | None:
-    """Return the steps to leave out, bool ``[B, T, 1]``, or None.
+def find_target(
+    tensordict: TensorDictBase,
+    action: NestedKey = "action",
+    expert_action: NestedKey = "expert_action",
+    disturbed: NestedKey = "disturbed",
+    masks: tuple[NestedKey, ...] = (),
+) -> tuple[torch.Tensor, torch.Tensor | None]:
+    """Return the actions to imitate, ``[B, T, A]``, and the steps to leave out, bool ``[B, T, 1]`` or None.
 
     Args:
         tensordict: ``[B, T]``.
+        action: key of the executed actions.
+        expert_action: key of what the demonstrator would have done. Where it is missing, executed actions are
+            imitated, except in disturbed steps.
         disturbed: key of the steps in which the demonstrator did not act.
         masks: keys of masks that are false for invalid steps.
     """
-    ignore = tensordict.get(disturbed, None)
+    target, ignore = tensordict.get(expert_action, None), None
+    if target is None:
+        target, ignore = tensordict[action], tensordict.get(disturbed, None)
     for key in masks:
         if (mask := tensordict.get(key, None)) is not None:
             invalid = ~mask.reshape(*tensordict.shape, 1)
             ignore = invalid if ignore is None else ignore | invalid
-    return ignore
+    return target, ignore
 
 
 class ImitationLoss(LossModule):
     """L1 loss of a policy on latents and hidden states (paper, Sec. III-B); see :func:`imitation_loss`.
 
     Input ``[B, T]``: ``latent``, ``hidden1``, ``hidden2``, ``goal`` and the demonstrator's ``action`` (SI units).
-    Optional: ``disturbed`` bool ``[B, T, 1]``, the steps to leave out, and a mask of valid steps as in
+    Optional: ``expert_action`` to imitate in the place of ``action``, or ``disturbed`` bool ``[B, T, 1]``, the steps to
+    leave out (see :func:`find_target`), and a mask of valid steps as in
     :class:`dynmap_rl.objectives.WorldModelLoss`.
 
     Output: ``loss_policy``, a scalar.
@@ -83,6 +93,7 @@ class ImitationLoss(LossModule):
         hidden2: NestedKey = "hidden2"
         goal: NestedKey = "goal"
         action: NestedKey = "action"
+        expert_action: NestedKey = "expert_action"
         disturbed: NestedKey = "disturbed"
 
     tensor_keys: _AcceptedKeys
@@ -106,7 +117,9 @@ class ImitationLoss(LossModule):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Return the loss."""
-        *states, action = (tensordict[key] for key in self.in_keys)
-        ignore = find_ignored(tensordict, self.tensor_keys.disturbed, self._loss_mask_keys())
-        loss = imitation_loss(self.policy(*states), action, self.policy.action, ignore, self.emphasis)
+        keys = self.tensor_keys
+        states = (tensordict[key] for key in self.in_keys[:-1])
+        masks = self._loss_mask_keys()
+        target, ignore = find_target(tensordict, keys.action, keys.expert_action, keys.disturbed, masks)
+        loss = imitation_loss(self.policy(*states), target, self.policy.action, ignore, self.emphasis)
         return TensorDict({"loss_policy": loss}, [])

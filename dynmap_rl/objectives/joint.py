@@ -11,7 +11,7 @@ from torchrl.objectives.common import LossModule
 
 from dynmap_rl.modules.policy import FeedforwardPolicy, RecurrentPolicy
 
-from .imitation import find_ignored, imitation_loss
+from .imitation import find_target, imitation_loss
 from .world_model import WorldModelLoss
 
 
@@ -20,8 +20,9 @@ class JointLoss(LossModule):
 
     The gradient of the policy's loss reaches encoder and transition.
 
-    Input: the input of :class:`WorldModelLoss` and ``goal`` ``[B, T, G]``. Optional: ``disturbed`` bool ``[B, T, 1]``,
-    the steps that the policy's loss leaves out, as it leaves out steps that a mask marks as invalid.
+    Input: the input of :class:`WorldModelLoss` and ``goal`` ``[B, T, G]``. Optional: ``expert_action``
+    to imitate in the place of ``action``, or ``disturbed`` bool ``[B, T, 1]``, the steps that the policy's loss leaves
+    out (see :func:`find_target`), as it leaves out steps that a mask marks as invalid.
 
     Output: ``loss_policy`` (times ``beta_joint``) and, except for end-to-end training, the world model's losses.
 
@@ -39,6 +40,7 @@ class JointLoss(LossModule):
         action: NestedKey = "action"
         dynamics: NestedKey = "dynamics"
         goal: NestedKey = "goal"
+        expert_action: NestedKey = "expert_action"
         disturbed: NestedKey = "disturbed"
 
     tensor_keys: _AcceptedKeys
@@ -60,7 +62,7 @@ class JointLoss(LossModule):
     def set_keys(self, **kwargs) -> None:
         """Set keys of this loss and of the world model's loss."""
         super().set_keys(**kwargs)
-        own = ("goal", "disturbed")
+        own = ("goal", "expert_action", "disturbed")
         self.world_model_loss.set_keys(**{k: v for k, v in kwargs.items() if k not in own})
 
     @property
@@ -89,8 +91,7 @@ class JointLoss(LossModule):
         latent, states = self.world_model_loss.predict(tensordict)
         losses = {} if self.end_to_end else self.world_model_loss.compare(tensordict, latent, states)
         predicted = self.policy(latent, *states[1:], tensordict[self.tensor_keys.goal])
-        action = tensordict[self.world_model_loss.tensor_keys.action]
-        masks = self.world_model_loss._loss_mask_keys()
-        ignore = find_ignored(tensordict, self.tensor_keys.disturbed, masks)
-        loss = imitation_loss(predicted, action, self.policy.action, ignore, self.emphasis)
+        keys, masks = self.tensor_keys, self.world_model_loss._loss_mask_keys()
+        target, ignore = find_target(tensordict, keys.action, keys.expert_action, keys.disturbed, masks)
+        loss = imitation_loss(predicted, target, self.policy.action, ignore, self.emphasis)
         return TensorDict({**losses, "loss_policy": self.beta_joint * loss}, [])

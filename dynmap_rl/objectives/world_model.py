@@ -10,7 +10,6 @@ from tensordict.nn import dispatch
 from tensordict.utils import NestedKey, unravel_key
 from torchrl.objectives.common import LossModule
 
-from dynmap_rl.modules.layers import to_blocks
 from dynmap_rl.modules.world_model import WorldModel
 
 
@@ -35,6 +34,8 @@ class WorldModelLoss(LossModule):
         beta_dynamics: weight of the loss of every supervised quantity.
         stop_gradient: train only the predicted change of the latent with the latent loss. Its full gradient favours
             latents that do not vary, and the reconstruction stalls.
+        rarity: weight of rare colours in ``loss_rgb``, see :func:`color_weights`; 0 is the paper's loss, in which the
+            background outweighs small objects.
         rgb_steps: number of random steps of a window whose frames are decoded; None decodes all.
         generator: generator that draws these steps; by default torch's own.
     """
@@ -54,13 +55,14 @@ class WorldModelLoss(LossModule):
         beta_z: float = 0.1,
         beta_dynamics: float = 1.0,
         stop_gradient: bool = True,
+        rarity: float = 0.0,
         rgb_steps: int | None = None,
         generator: torch.Generator | None = None,
     ):
         super().__init__()
         self.world_model, self.generator = world_model, generator
         self.beta_z, self.beta_dynamics = beta_z, beta_dynamics
-        self.stop_gradient, self.rgb_steps = stop_gradient, rgb_steps
+        self.stop_gradient, self.rarity, self.rgb_steps = stop_gradient, rarity, rgb_steps
 
     @property
     def in_keys(self) -> list[NestedKey]:
@@ -123,10 +125,33 @@ class WorldModelLoss(LossModule):
         if self.rgb_steps is not None and self.rgb_steps < steps:
             index = torch.randperm(steps, generator=self.generator, device=pixels.device)[: self.rgb_steps]
             masks, pixels, states = masks[:, index], pixels[:, index], [s[:, index] for s in states]
-        blocks = self.world_model.image_decoder.decode_blocks(*states).flatten(0, 1)
-        target = to_blocks(pixels.flatten(0, 1)).to(blocks.dtype) * (1 / 255) - 0.5
-        norm = torch.linalg.vector_norm(blocks - target, dim=(1, 2, 3)).float()
-        return self._mean(norm.view(masks.shape), masks) / blocks[0].numel() ** 0.5
+        frames = self.world_model.decode_pixels(*states).float()
+        error = (frames - pixels / 255).square().mean(-3)  # (B, T, 64, 64)
+        if self.rarity:
+            error = error * color_weights(pixels, self.rarity)
+        return self._mean((error.mean((-2, -1)) + 1e-8).sqrt(), masks)
+
+
+@torch.no_grad()
+def color_weights(pixels: torch.Tensor, power: float) -> torch.Tensor:
+    """Return weights of pixels that fall with the frequency of their colour in the frame; their mean is 1.
+
+    Colours count as equal if the upper four bits of their channels are.
+
+    Args:
+        pixels: frames uint8 ``[..., 3, H, W]``.
+        power: a weight is the number of pixels of the colour to the power of ``-power``. With 1, every colour of a
+            frame has the same share.
+
+    Returns:
+        ``[..., H, W]``.
+    """
+    red, green, blue = (pixels >> 4).long().flatten(0, -4).flatten(2).unbind(1)  # (N, H W)
+    color = (red << 8) | (green << 4) | blue
+    count = torch.zeros(len(color), 4096, device=color.device)
+    count.scatter_add_(1, color, torch.ones_like(color, dtype=count.dtype))
+    weight = count.gather(1, color).pow(-power)
+    return (weight / weight.mean(1, keepdim=True)).view(*pixels.shape[:-3], *pixels.shape[-2:])
 
 
 def rms(x: torch.Tensor) -> torch.Tensor:

@@ -135,6 +135,7 @@ class Session:
         if self.actor:
             self._predict(seen.set("action", action))  # as in an evaluation: before the cart's limits
         td["action"] = torch.as_tensor(self.world.action, dtype=torch.float32).reshape(1, 3)
+        td["expert_action"] = td["action"]  # who drives is the one to imitate
         self.steps.append(td.select(*KEYS).clone())
         self.td = td["next"]
         self._note()

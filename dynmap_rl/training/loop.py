@@ -55,7 +55,9 @@ def fit(
     device = next(model.parameters()).device
     model.to(memory_format=torch.channels_last)  # with bfloat16 six times faster on a CPU
     optimizer = make_optimizer(model, settings.learning_rate, weight_decay=1e-4)
-    episodes = episodes.select("pixels", "action", "goal", "dynamics", "disturbed", strict=False).to(device)
+    episodes = episodes.select(
+        "pixels", "action", "goal", "dynamics", "disturbed", "expert_action", strict=False
+    ).to(device)
     generator = torch.Generator(device).manual_seed(1000 * seed)
     loss_module = make_loss(generator)
     start, first, path = 0, None, folder / "checkpoint" / "world_model.pt"

@@ -85,7 +85,7 @@ def train_ppo(
     truncate_metrics(folder, start)
 
     # Every iteration starts from new, seeded scenes, so that a resumed run equals an uninterrupted one.
-    frames = env.batch_size.numel() * EPISODE_STEPS
+    frames = env.batch_size.numel() * settings.steps
     progress = tqdm(
         range(start, settings.iterations), initial=start, total=settings.iterations, unit="iteration"
     )
@@ -95,20 +95,18 @@ def train_ppo(
         env.set_seed(settings.seed + 1000 * (iteration + 1))
         for group in optimizer.param_groups:
             group["lr"] = settings.learning_rate * (1 - 0.9 * iteration / settings.iterations)
-        batch = collect(env, network)
+        batch = collect(env, network, settings.steps)
         losses = update(batch, policy_loss, critic, advantage, optimizer, settings, threads)
-        done = batch["next", "done"].squeeze(-1)
         seconds += time.perf_counter() - began
         metrics = {
             "frames": (iteration + 1) * frames,
             "seconds": seconds,
             "reward": batch["next", "reward"].mean(),
-            "success": batch["next", "is_success"].squeeze(-1)[done].float().mean(),
-            "drop": batch["next", "dropped"].squeeze(-1)[done].float().mean(),
+            "drop": batch["next", "dropped"].any(1).float().mean(),
             **losses,
         }
         log_metrics(folder, iteration + 1, logger, **metrics)
-        progress.set_postfix(success=f"{metrics['success']:.2f}", drop=f"{metrics['drop']:.2f}")
+        progress.set_postfix(reward=f"{metrics['reward']:.2f}", drop=f"{metrics['drop']:.2f}")
         last = iteration + 1 == settings.iterations
         if last or (iteration + 1) % settings.checkpoint_every == 0:
             judged = judge(settings.final_episodes if last else settings.eval_episodes)
@@ -129,13 +127,13 @@ def train_ppo(
 
 
 @torch.no_grad()
-def collect(env: EnvBase, network: ExpertNetwork) -> TensorDictBase:
-    """Roll out one episode's length in each world, ``[N, T]``, with actions drawn from the network's distribution."""
+def collect(env: EnvBase, network: ExpertNetwork, steps: int = EPISODE_STEPS) -> TensorDictBase:
+    """Roll out a number of steps from new scenes, ``[N, T]``, with actions drawn from the network's distribution."""
 
     def act(td: TensorDictBase) -> TensorDictBase:
         return td.set("action", torch.normal(*network(td["state"])))
 
-    batch = env.rollout(EPISODE_STEPS, act, break_when_any_done=False)
+    batch = env.rollout(steps, act, break_when_any_done=False)
     # All probabilities at once: one distribution a step takes longer than the network.
     distribution = IndependentNormal(*network(batch["state"]))
     return batch.set("action_log_prob", distribution.log_prob(batch["action"]))

@@ -15,10 +15,12 @@ class WorldModelArchitecture:
 
     # Dynamics that the world model predicts: any of position,velocity,acceleration, or none (Only-RGB).
     supervision: str = "position,velocity"
-    # Add spatial-softmax keypoints to the features of the plain CNN (beyond the paper).
-    keypoints: bool = False
+    # attention (positions and colours where attention maps look, blobs to masks of a few colours), or the paper's plain
+    # CNNs.
+    architecture: str = "attention"
 
     def __post_init__(self):
+        check_choice(self, "architecture", ("attention", "plain"))
         for name in self.supervision.split(","):
             if name.strip() not in ("none", *DYNAMICS) or (
                 "none" in self.supervision and "," in self.supervision
@@ -34,15 +36,18 @@ class WorldModelTraining(WorldModelArchitecture):
     """Form and training of a world model (paper, Eq. 4a and 5)."""
 
     # Optimiser steps.
-    updates: int = 2500
+    updates: int = 1500
     # Windows in a batch.
-    windows: int = 16
+    windows: int = 12
     # Time steps of a window.
     window_steps: int = 24
     # Frames decoded in a window, drawn at random.
-    rgb_steps: int = 8
+    rgb_steps: int = 6
     # Peak learning rate (100 steps of warm-up, then a cosine).
     learning_rate: float = 2e-3
+    # Weight of rare colours in the RGB loss: a pixel's weight falls with this power of the number of pixels of its
+    # colour; 0 is the paper's plain L2.
+    rarity: float = 0.75
     # Weight of the latent loss (Eq. 4a).
     beta_z: float = 0.1
     # Weight of the loss of every supervised quantity (Eq. 5).
@@ -56,7 +61,7 @@ class WorldModelTraining(WorldModelArchitecture):
         super().__post_init__()
         check_at_least(self, 1, "updates", "windows", "rgb_steps")
         check_at_least(self, 2, "window_steps")
-        check_at_least(self, 0, "learning_rate", "beta_z", "beta_dynamics")
+        check_at_least(self, 0, "learning_rate", "rarity", "beta_z", "beta_dynamics")
 
 
 @dataclass(frozen=True)
@@ -122,6 +127,9 @@ class JointTraining(EndToEndTraining):
 
     # Frames decoded in a window, drawn at random.
     rgb_steps: int = 16
+    # Weight of rare colours in the RGB loss: a pixel's weight falls with this power of the number of pixels of its
+    # colour; 0 is the paper's plain L2.
+    rarity: float = 0.75
     # Weight of the latent loss (Eq. 4a).
     beta_z: float = 0.1
     # Weight of the loss of every supervised quantity (Eq. 5).
@@ -132,7 +140,7 @@ class JointTraining(EndToEndTraining):
     def __post_init__(self):
         super().__post_init__()
         check_at_least(self, 1, "rgb_steps")
-        check_at_least(self, 0, "beta_z", "beta_dynamics", "beta_joint")
+        check_at_least(self, 0, "rarity", "beta_z", "beta_dynamics", "beta_joint")
 
 
 @dataclass(frozen=True)
@@ -141,12 +149,14 @@ class PPOTraining:
 
     # Seed of everything random.
     seed: int = 0
-    # Worlds stepped together; an iteration runs one episode's length in all of them.
-    num_envs: int = 64
+    # Worlds stepped together, each from a new scene in every iteration. Many scenes matter more than long episodes.
+    num_envs: int = 192
+    # Steps of an iteration in every world.
+    steps: int = 40
     # Iterations: rollouts and the updates from them.
-    iterations: int = 45
+    iterations: int = 60
     # Passes over the frames of an iteration.
-    epochs: int = 10
+    epochs: int = 8
     # Frames in a minibatch.
     minibatch: int = 1024
     # Initial learning rate, which falls to a tenth.
@@ -160,13 +170,13 @@ class PPOTraining:
     # Weight of the entropy.
     entropy: float = 1e-3
     # Iterations between checkpoints.
-    checkpoint_every: int = 5
+    checkpoint_every: int = 10
     # Scenes on which a checkpoint is judged, with the policy's mean action.
     eval_episodes: int = 200
     # Scenes on which the last checkpoint is judged.
     final_episodes: int = 1000
 
     def __post_init__(self):
-        names = "num_envs", "iterations", "epochs", "minibatch", "checkpoint_every"
+        names = "num_envs", "steps", "iterations", "epochs", "minibatch", "checkpoint_every"
         check_at_least(self, 1, *names, "eval_episodes", "final_episodes")
         check_at_least(self, 0, "learning_rate", "gamma", "gae_lambda", "clip", "entropy")

@@ -24,7 +24,8 @@ def build_world_model(constants: dict, settings: WorldModelArchitecture) -> Worl
         constants: of the dataset's normalisation, ``{name: {"low": [D], "high": [D]}}``.
         settings: form of the world model.
     """
-    return make_world_model(constants, parse_supervision(settings.supervision), keypoints=settings.keypoints)
+    supervision = parse_supervision(settings.supervision)
+    return make_world_model(constants, supervision, architecture=settings.architecture)
 
 
 def train_world_model(
@@ -69,5 +70,5 @@ def make_loss(
     world_model: WorldModel, settings: WorldModelTraining | JointTraining, generator: torch.Generator
 ) -> WorldModelLoss:
     """Make the world model's loss module, whose decoded frames ``generator`` draws."""
-    weights = settings.beta_z, settings.beta_dynamics
-    return WorldModelLoss(world_model, *weights, rgb_steps=settings.rgb_steps, generator=generator)
+    weights = {"beta_z": settings.beta_z, "beta_dynamics": settings.beta_dynamics, "rarity": settings.rarity}
+    return WorldModelLoss(world_model, **weights, rgb_steps=settings.rgb_steps, generator=generator)

@@ -116,7 +116,7 @@ def evaluation(dataset: str, episodes: int = 1000, single: int = 5) -> dict:
         actor = Actor(world_model, policy, mixed=True)
         return seconds(lambda: roll_out(actor, "balance_reaching", scene_seeds("test", episodes))) / episodes
 
-    env = gym.make("dynmap_rl/BalanceReaching-v0", obs_type="pixels_agent_pos")
+    env = gym.make("dynmap_rl/BalanceReaching-v1", obs_type="pixels_agent_pos")
 
     @torch.no_grad()
     def one_at_a_time():

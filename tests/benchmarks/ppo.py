@@ -85,7 +85,7 @@ def stable_baselines(seed: int, iterations: int, num_envs: int, episodes: int, t
         return sum(task.is_success(world) for world in worlds) / len(worlds)
 
     def make():
-        env = gym.make("dynmap_rl/BalanceReaching-v0", obs_type="state", control="acceleration")
+        env = gym.make("dynmap_rl/BalanceReaching-v1", obs_type="state", control="acceleration")
         return gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
 
     model = PPO(

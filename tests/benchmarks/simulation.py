@@ -86,7 +86,7 @@ def pusht() -> dict | None:
     """
     if "PUSHT_PYTHON" not in os.environ:
         return None
-    env = gym.make("dynmap_rl/BalanceReaching-v0", obs_type="pixels")
+    env = gym.make("dynmap_rl/BalanceReaching-v1", obs_type="pixels")
     actions = smooth_actions().astype(np.float32)
 
     def ours():

@@ -39,6 +39,7 @@ def test_shapes_and_types(recording):
         "agent_pos": ((6, 120, 5), torch.float32),
         "goal": ((6, 120, 2), torch.float32),
         "action": ((6, 120, 3), torch.float32),
+        "expert_action": ((6, 120, 3), torch.float32),
         **{("dynamics", k): ((6, 120, 6), torch.float32) for k in DYNAMICS},
         "disturbed": ((6, 120, 1), torch.bool),
         ("next", "reward"): ((6, 120, 1), torch.float32),

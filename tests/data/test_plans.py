@@ -86,7 +86,8 @@ def test_next_columns_come_after_the_action(dataset):
 def test_pushes_are_as_many_as_the_task_says_and_most_of_them_early(task):
     plans = plan_demonstrations(task, "train", 0, 60)
     disturbed = [plan.pushes for plan in plans if plan.pushes]
-    assert len(disturbed) == 40
+    assert len(disturbed) == 20
+    assert len([plan for plan in plans if plan.noise]) == 40
     assert {len(pushes) for pushes in disturbed} == {get_task(task).pushes}
     starts = [start for pushes in disturbed for start, _ in pushes]
     assert min(starts) >= 0 and max(starts) <= 95

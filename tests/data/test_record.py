@@ -132,7 +132,7 @@ def test_a_folder_with_something_else_is_refused(tmp_path):
     ("changes", "message"),
     [
         ({"kind": "exploration"}, "kind exploration instead of demonstrations"),
-        ({"format": 2}, "format 2 instead of 3"),
+        ({"format": 2}, "format 2 instead of 4"),
     ],
 )
 def test_unfinished_shards_of_other_settings_are_refused(tmp_path, changes, message):

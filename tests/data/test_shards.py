@@ -55,7 +55,9 @@ def test_failures_are_replaced_by_the_next_candidates(tmp_path, monkeypatch):
     checkpoints = list_checkpoints("bin_dropping")
     plans, episodes = module._roll_out_shard(shard)
     assert [plan.scene_seed for plan in plans] == [501, 504, 507, 510, 513]
-    assert [plan.checkpoint for plan in plans] == [checkpoints[i % 5] for i in (1, 4, 2, 0, 3)]
+    assert [plan.checkpoint for plan in plans] == [
+        checkpoints[i // 3 % len(checkpoints)] for i in (501, 504, 507, 510, 513)
+    ]
     assert episodes.shape == (5, 120)
     assert [seed for batch in rolled for seed in batch] == list(range(500, 500 + sum(map(len, rolled))))
     monkeypatch.setattr(module, "CANDIDATES_PER_SHARD", 10)

@@ -9,7 +9,7 @@ import torch
 from dynmap_rl.envs.gym_env import DynmapEnv
 from dynmap_rl.envs.scene import BinRanges, ObstacleRanges, Scene, SceneRanges, choose_ranges
 from dynmap_rl.envs.task import MARKER_SIZE
-from dynmap_rl.envs.tasks import TASKS, get_task
+from dynmap_rl.envs.tasks import FAILURE, TASKS, get_task
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.envs.world import ACTION_LIMIT, EPISODE_STEPS, World
 from dynmap_rl.experts.network import load_expert
@@ -18,9 +18,9 @@ TASK = get_task("balance_reaching")
 STILL = np.zeros(3)
 PROGRESS = 5 * math.hypot(*ACTION_LIMIT[:2])  # the most that a step of task 2 adds
 REWARDS = {  # what each says of its range
-    "balance_reaching": (-0.2, 1.0),
-    "balance_reaching_obstacle": (-1.0, 1.0 + PROGRESS),
-    "bin_dropping": (-1.0, 1.0),
+    "balance_reaching": (FAILURE, 1.0),
+    "balance_reaching_obstacle": (FAILURE, 1.0 + PROGRESS),
+    "bin_dropping": (FAILURE / 4, 1.0),
 }
 
 every_task = pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
@@ -149,10 +149,10 @@ def test_reward_is_less_for_effort_and_tilt():
     assert TASK.reward(tilted) < TASK.reward(world_at(0.3))
 
 
-def test_dropped_block_earns_nothing():
+def test_dropped_block_is_a_failure():
     world = world_at(0.0)
     world.dropped = True
-    assert TASK.reward(world) == 0
+    assert TASK.reward(world) == FAILURE
 
 
 @pytest.mark.parametrize("distance, success", [(0.0, True), (0.049, True), (0.051, False)])

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from dynmap_rl.envs.gym_env import DynmapEnv
 from dynmap_rl.envs.scene import BinScene
 from dynmap_rl.envs.substeps import read_bodies
-from dynmap_rl.envs.tasks import get_task
+from dynmap_rl.envs.tasks import FAILURE, get_task
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.envs.world import GRAVITY, World
 
@@ -93,7 +93,7 @@ def test_block_that_falls_beside_has_missed(x):
     first = over.index(True)
     assert over == [False] * first + [True] * (len(rows) - first)
     assert not any(row["success"] for row in rows)
-    assert all((row["reward"] == -1) is row["over"] for row in rows)
+    assert all((row["reward"] == FAILURE / 4) is row["over"] for row in rows)
 
 
 def test_a_drop_alone_is_no_failure():
@@ -115,7 +115,7 @@ def test_cart_that_touches_the_bin_fails_for_good(over_it):
         world.step(action)
         assert TASK.is_over(world)
         assert not TASK.is_success(world)
-        assert TASK.reward(world) == -1
+        assert TASK.reward(world) == FAILURE / 4
     assert world.position[1] > 0.3
 
 

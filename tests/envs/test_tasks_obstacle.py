@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from dynmap_rl.envs.geometry import length, path_is_blocked, way_around
 from dynmap_rl.envs.gym_env import DynmapEnv
 from dynmap_rl.envs.scene import ObstacleRanges, ObstacleScene
-from dynmap_rl.envs.tasks import get_task
+from dynmap_rl.envs.tasks import FAILURE, get_task
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.envs.world import CONTROL_DT, EPISODE_STEPS, World
 
@@ -56,7 +56,7 @@ def test_success_needs_the_goal_and_the_block():
         world.step(STILL)
     assert world.position_error < 1e-6 and world.touched == set()
     assert TASK.is_over(world) and not TASK.is_success(world)
-    assert TASK.reward(world) == -1
+    assert TASK.reward(world) == FAILURE
 
 
 def test_touch_terminates_and_is_not_taken_back():
@@ -71,7 +71,7 @@ def test_touch_terminates_and_is_not_taken_back():
     assert 5 < first < 60
     assert touched == [False] * first + [True] * (EPISODE_STEPS - first)
     assert [terminated for _, terminated, *_ in results] == touched
-    assert [reward == -1 for reward, *_ in results] == touched
+    assert [reward == FAILURE for reward, *_ in results] == touched
     assert env.world.position[0] < 0.3
     assert not any(info["is_success"] for *_, info in results)
 
@@ -94,9 +94,9 @@ def test_reward_is_higher_along_the_way_than_into_the_obstacle():
         rewards[1].append(move(straight, towards(straight, way[-1])))
     assert around.touched == set() and straight.touched
     assert not around.dropped
-    untouched = rewards[1].index(-1)
+    untouched = rewards[1].index(FAILURE)
     assert sum(rewards[0][:untouched]) > sum(rewards[1][:untouched])
-    assert min(rewards[0][untouched:]) > max(rewards[1][untouched:]) == -1
+    assert min(rewards[0][untouched:]) > max(rewards[1][untouched:]) == FAILURE
 
 
 def test_reward_grows_along_the_way():

@@ -15,11 +15,12 @@ from torchrl.envs.utils import check_env_specs
 
 from dynmap_rl.envs.tasks import TASKS
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
+from dynmap_rl.envs.world import ACCELERATION_LIMIT, ACTION_LIMIT
 from dynmap_rl.keys import GYMNASIUM_IDS
 
 every_task = pytest.mark.parametrize("task", TASKS)
 
-LIMIT = {"position": [0.02, 0.02, 0.05], "acceleration": [3.0, 3.0, 10.0]}
+LIMIT = {"position": ACTION_LIMIT.tolist(), "acceleration": ACCELERATION_LIMIT.tolist()}
 
 
 def seeded(env: DynmapBatchedEnv, seeds) -> TensorDict:

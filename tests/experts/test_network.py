@@ -27,7 +27,7 @@ from dynmap_rl.reporting.media import film
 from dynmap_rl.utils.files import read_json
 
 TASK = "balance_reaching"
-LIMIT = (3.0, 3.0, 10.0)
+LIMIT = tuple(ACCELERATION_LIMIT)
 SHIPPED = sorted((path.parent.name, path.stem) for path in CHECKPOINTS.glob("*/*.safetensors"))
 
 

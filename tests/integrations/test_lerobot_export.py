@@ -25,20 +25,20 @@ from dynmap_rl.utils.files import read_json, write_json
 from dynmap_rl.utils.weights import fingerprint
 
 
-def make_run(folder, kind, keypoints=False, goal=2):
+def make_run(folder, kind, architecture="attention", goal=2):
     sizes = {"action": 3, "goal": goal, "position": 6}
     meta = {name: {"low": [-1.0] * n, "high": [2.0] * n} for name, n in sizes.items()}
-    world_model = make_world_model(meta, ("position",), 16, 24, keypoints)
+    world_model = make_world_model(meta, ("position",), 16, 24, architecture)
     policy = make_own_policy(meta, kind, world_model, width=20)
     save_world_model(folder / "world_model", world_model)
     save_policy(folder / "seed_1" / "policy", policy, world_model)
     return world_model, policy
 
 
-@pytest.mark.parametrize(("kind", "keypoints"), [("recurrent", False), ("feedforward", True)])
-def test_a_run_exports_to_lerobot_and_back(tmp_path, kind, keypoints):
+@pytest.mark.parametrize(("kind", "architecture"), [("recurrent", "attention"), ("feedforward", "plain")])
+def test_a_run_exports_to_lerobot_and_back(tmp_path, kind, architecture):
     run, exported, back = tmp_path / "run", tmp_path / "pretrained_model", tmp_path / "back"
-    world_model, policy = make_run(run, kind, keypoints)
+    world_model, policy = make_run(run, kind, architecture)
     export_to_lerobot(run, exported, seed=1)
     theirs = make_policy(config_of(exported), env_cfg=DynmapEnvConfig())
     assert type(theirs) is DynmapPolicy

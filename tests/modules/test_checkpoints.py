@@ -19,9 +19,9 @@ from dynmap_rl.modules.world_model import WorldModel
 from dynmap_rl.utils.weights import fingerprint
 
 
-@pytest.mark.parametrize(("kind", "keypoints"), [("recurrent", False), ("feedforward", True)])
-def test_checkpoints_are_complete(tmp_path, kind, keypoints):
-    model = make_world_model(CONSTANTS, ("position",), 16, 24, keypoints)
+@pytest.mark.parametrize(("kind", "architecture"), [("recurrent", "attention"), ("feedforward", "plain")])
+def test_checkpoints_are_complete(tmp_path, kind, architecture):
+    model = make_world_model(CONSTANTS, ("position",), 16, 24, architecture)
     policy = make_policy(CONSTANTS, kind, model, width=20)
     save_world_model(tmp_path / "model", model)
     save_policy(tmp_path / "policy", policy, model)
@@ -29,6 +29,19 @@ def test_checkpoints_are_complete(tmp_path, kind, keypoints):
     for before, after in zip((model, policy), loaded, strict=True):
         assert type(before) is type(after) and not after.training
         assert fingerprint(before) == fingerprint(after)
+
+
+def test_a_world_model_of_the_first_release_is_plain_or_refused(tmp_path):
+    model = make_world_model(CONSTANTS, ("position",), 16, 24, "plain")
+    save_world_model(tmp_path, model)
+    path = tmp_path / "arguments.json"
+    arguments = json.loads(path.read_text())
+    del arguments["architecture"]
+    path.write_text(json.dumps(arguments | {"keypoints": False}))
+    assert fingerprint(load_world_model(tmp_path)) == fingerprint(model)
+    path.write_text(json.dumps(arguments | {"keypoints": True}))
+    with pytest.raises(ValueError, match="train it again"):
+        load_world_model(tmp_path)
 
 
 @pytest.fixture

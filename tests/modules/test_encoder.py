@@ -4,13 +4,13 @@ import pytest
 import torch
 from torch.nn.functional import pixel_shuffle, pixel_unshuffle
 
-from dynmap_rl.modules.encoder import Encoder, SpatialSoftmax
+from dynmap_rl.modules.encoder import AttentionEncoder, PlainEncoder
 from dynmap_rl.modules.layers import to_blocks
 
 
-@pytest.mark.parametrize("keypoints", [True, False])
-def test_encoder_keeps_leading_axes_and_refuses_other_frames(keypoints):
-    encoder = Encoder(16, keypoints=keypoints)
+@pytest.mark.parametrize("make", [AttentionEncoder, PlainEncoder])
+def test_encoder_keeps_leading_axes_and_refuses_other_frames(make):
+    encoder = make(16)
     frames = torch.randint(0, 256, (2, 3, 3, 64, 64), dtype=torch.uint8)
     latent = encoder(frames)
     assert latent.shape == (2, 3, 16)
@@ -20,9 +20,10 @@ def test_encoder_keeps_leading_axes_and_refuses_other_frames(keypoints):
         encoder(torch.zeros(1, 3, 32, 32))
 
 
+@pytest.mark.parametrize("make", [AttentionEncoder, PlainEncoder])
 @torch.no_grad()
-def test_chunks_of_many_frames_have_the_latents_of_one_batch():
-    encoder = Encoder(16)
+def test_chunks_of_many_frames_have_the_latents_of_one_batch(make):
+    encoder = make(16)
     frames = torch.randint(0, 256, (70, 3, 64, 64), dtype=torch.uint8)
     with torch.enable_grad():
         whole = encoder(frames)
@@ -44,7 +45,7 @@ def test_frames_as_blocks_and_back(change):
 @torch.no_grad()
 def test_a_frame_s_scale_and_colour_reach_the_latent():
     """Scaled weights on raw bytes equal plain weights on a frame in -0.5..0.5, except at the border."""
-    encoder = Encoder(16)
+    encoder = PlainEncoder(16)
     frames = torch.randint(0, 256, (2, 3, 64, 64), dtype=torch.uint8)
     frames[..., [0, -1], :] = frames[..., :, [0, -1]] = 0
     maps = encoder.stem(pixel_unshuffle(frames / 255 - 0.5, 4)).relu()[..., 1:-1, 1:-1]
@@ -58,9 +59,21 @@ def test_a_frame_s_scale_and_colour_reach_the_latent():
     assert not torch.equal(latent, color)
 
 
-def test_keypoints_are_where_the_map_is_bright():
-    softmax = SpatialSoftmax(1, 1)
-    torch.nn.init.constant_(softmax.logits.weight, 100.0)
-    x = torch.zeros(1, 1, 8, 8)
-    x[0, 0, 7, 0] = 1.0  # row 7, column 0
-    assert softmax(x)[0].tolist() == pytest.approx([-1.0, 1.0])
+@torch.no_grad()
+def test_attention_reads_position_and_colour_of_the_place_it_looks_at():
+    """A map that looks at dark blocks alone finds where the dark block is, and its colour."""
+    encoder = AttentionEncoder(16, maps=1)
+    frames = torch.full((1, 3, 64, 64), 255, dtype=torch.uint8)
+    frames[0, :, 8:12, 40:44] = torch.tensor([30, 60, 90], dtype=torch.uint8)[:, None, None]
+    attend = encoder.attend.register_forward_hook(
+        lambda _m, _i, out: torch.zeros_like(out).index_put_(
+            tuple(torch.tensor(i) for i in ((0,) * 4, range(4), (2,) * 4, (10,) * 4)), torch.tensor(100.0)
+        )
+    )
+    seen = []
+    encoder.linear.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0][0]))
+    encoder(frames)
+    attend.remove()
+    x, y, *color = (seen[0][:5] / 2).tolist()
+    assert (x, y) == pytest.approx((42 / 32 - 1, 10 / 32 - 1), abs=1e-5)
+    assert color == pytest.approx([v / 255 - 0.5 for v in (30, 60, 90)], abs=1e-5)

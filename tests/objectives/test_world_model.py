@@ -4,11 +4,10 @@ import pytest
 import torch
 from small import CONSTANTS
 from tensordict import TensorDict
-from torch.nn.functional import pixel_unshuffle
 
 from dynmap_rl.keys import DYNAMICS
 from dynmap_rl.modules.checkpoints import make_world_model
-from dynmap_rl.objectives.world_model import WorldModelLoss, rms
+from dynmap_rl.objectives.world_model import WorldModelLoss, color_weights, rms
 
 CONSTANTS = CONSTANTS | {q: {"low": [-2.0] * 6, "high": [2.0] * 6} for q in DYNAMICS}
 
@@ -55,7 +54,7 @@ def test_a_model_that_copies_its_input_frame_predicts_a_delayed_sequence_only():
     _, loss = make(())
     frames = torch.randint(0, 256, (1, 6, 3, 64, 64), dtype=torch.uint8)
     # The prediction for t is the frame of t - 1.
-    loss.world_model.image_decoder.decode_blocks = lambda *_: pixel_unshuffle(frames[:, :-1] / 255 - 0.5, 4)
+    loss.world_model.decode_pixels = lambda *_: frames[:, :-1] / 255
     td = TensorDict({"pixels": frames, "action": torch.zeros(1, 6, 3)}, [1, 6])
     assert loss(td)["loss_rgb"] > 0.1
     td["pixels"] = torch.cat([frames[:, :1], frames[:, :-1]], 1)
@@ -80,6 +79,29 @@ def test_weights_scale_their_terms():
     _, heavy = make(("position",), beta_z=2.0, beta_dynamics=3.0)
     torch.testing.assert_close(heavy(td)["loss_latent"], 2 * plain(td)["loss_latent"])
     torch.testing.assert_close(heavy(td)["loss_position"], 3 * plain(td)["loss_position"])
+
+
+def test_weights_of_colours_have_mean_one_and_fall_with_frequency():
+    pixels = torch.zeros(2, 3, 8, 8, dtype=torch.uint8)
+    pixels[:, 0, 0, :4] = 200
+    weight = color_weights(pixels, 0.5)
+    torch.testing.assert_close(weight.mean((1, 2)), torch.ones(2))
+    torch.testing.assert_close(weight[0, 0, 0] / weight[0, 5, 5], torch.tensor((60 / 4) ** 0.5))
+    equal = color_weights(pixels, 1.0)
+    torch.testing.assert_close(equal[0, 0, :4].sum(), equal[0].sum() / 2, msg="the same share of each colour")
+    torch.testing.assert_close(color_weights(pixels, 0.0), torch.ones(2, 8, 8))
+
+
+def test_rarity_makes_an_error_on_a_small_object_count():
+    pixels = torch.full((1, 3, 3, 64, 64), 255, dtype=torch.uint8)
+    pixels[..., :4, :4] = 0
+    td = TensorDict({"pixels": pixels, "action": torch.zeros(1, 3, 3)}, [1, 3])
+    losses = []
+    for rarity in (0.0, 1.0):
+        _, loss = make((), rarity=rarity)
+        loss.world_model.decode_pixels = lambda *_: torch.ones(1, 2, 3, 64, 64)
+        losses.append(loss(td)["loss_rgb"].item())
+    assert losses == pytest.approx([1 / 16, 0.5**0.5], abs=1e-4)
 
 
 def test_rms_has_a_gradient_at_zero():

@@ -22,7 +22,7 @@ import numpy as np
 
 import dynmap_rl  # noqa: F401 (the ids)
 
-IDS = "dynmap_rl/BalanceReaching-v0", "dynmap_rl/BalanceReachingObstacle-v0", "dynmap_rl/BinDropping-v0"
+IDS = "dynmap_rl/BalanceReaching-v1", "dynmap_rl/BalanceReachingObstacle-v1", "dynmap_rl/BinDropping-v1"
 RESULTS = Path(__file__).parents[2] / "recipes/results/measurements/soak.json"
 GROWTH_MB = 2.0
 

@@ -25,7 +25,7 @@ import sys
 import gymnasium
 from stable_baselines3 import PPO
 assert "dynmap_rl" not in sys.modules
-model = PPO("MlpPolicy", gymnasium.make("dynmap_rl:dynmap_rl/BalanceReaching-v0", obs_type="state"), n_steps=64)
+model = PPO("MlpPolicy", gymnasium.make("dynmap_rl:dynmap_rl/BalanceReaching-v1", obs_type="state"), n_steps=64)
 print(model.learn(64).num_timesteps, sys.modules["dynmap_rl"].__file__)
 """
 

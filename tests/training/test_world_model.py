@@ -16,11 +16,10 @@ from dynmap_rl.utils.weights import fingerprint
 
 
 def test_architecture_is_that_of_the_settings():
-    plain = build_world_model(CONSTANTS, WorldModelArchitecture("none"))
-    assert plain.supervision == ()
-    model = build_world_model(CONSTANTS, WorldModelTraining(supervision="position", keypoints=True))
-    assert model.supervision == ("position",)
-    assert model.encoder.state_dict().keys() > plain.encoder.state_dict().keys()
+    default = build_world_model(CONSTANTS, WorldModelArchitecture("none"))
+    assert (default.supervision, default.architecture) == ((), "attention")
+    model = build_world_model(CONSTANTS, WorldModelTraining(supervision="position", architecture="plain"))
+    assert (model.supervision, model.architecture) == (("position",), "plain")
 
 
 def test_weights_change_and_metrics_are_logged(tmp_path):

@@ -41,7 +41,8 @@ How it was made: PyMunk simulates, pygame draws, {maker}. The command was
 | `observation.state` | 5 | commanded cart pose x, y, theta (m, m, rad) and goal x, y (m) |
 | `action` | 3 | change of the commanded cart pose in one step (m, m, rad) |
 | `next.reward`, `next.done`, `next.success` | 1 | after the action |
-| `disturbed` | 1 | a push acted in this step: not to be imitated |
+| `expert_action` | 3 | what the expert would have done, without noise and pushes: to be imitated |
+| `disturbed` | 1 | a push acted in this step in the place of the expert |
 | `dynamics.position` | 6 | cart x, y, theta, block x, y, theta (m, m, rad) |
 | `dynamics.velocity` | 6 | its rate, as the simulator has it (m/s, rad/s) |
 | `dynamics.acceleration` | 6 | change of velocity since the last step over {dt} s (m/s^2, rad/s^2); 0 at the start |

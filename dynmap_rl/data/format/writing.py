@@ -24,6 +24,7 @@ FEATURES = {
     CAMERA: {"dtype": "image", "shape": (64, 64, 3), "names": ["height", "width", "channels"]},
     "observation.state": {"dtype": "float32", "shape": (5,), "names": [*POSE, "goal_x", "goal_y"]},
     "action": {"dtype": "float32", "shape": (3,), "names": ["delta_x", "delta_y", "delta_theta"]},
+    "expert_action": {"dtype": "float32", "shape": (3,), "names": ["delta_x", "delta_y", "delta_theta"]},
     "next.reward": {"dtype": "float32", "shape": (1,), "names": ["reward"]},
     "next.done": {"dtype": "bool", "shape": (1,), "names": ["done"]},
     "next.success": {"dtype": "bool", "shape": (1,), "names": ["success"]},
@@ -67,7 +68,7 @@ def write_episodes(folder: Path, episodes: TensorDict, instruction: str) -> None
         dataset.finalize()
     written = load_dataset(folder)
     # LeRobot only logs a frame that could not be written.
-    for key in ("pixels", "agent_pos", "action", "dynamics", "disturbed"):
+    for key in ("pixels", "agent_pos", "action", "dynamics", "disturbed", "expert_action"):
         if not (written[key] == episodes[key]).all():
             raise OSError(f"{key} of {folder} must be as written, got other values; check the disk")
 
@@ -108,6 +109,7 @@ def _to_columns(episodes: TensorDict) -> dict[str, np.ndarray]:
         "next.done": episodes["next", "done"],
         "next.success": episodes["next", "is_success"],
         "disturbed": episodes["disturbed"],
+        "expert_action": episodes["expert_action"],
         **{f"dynamics.{name}": values for name, values in episodes["dynamics"].items()},
     }
     return {name: values.numpy() for name, values in columns.items()}

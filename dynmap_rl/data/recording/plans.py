@@ -13,7 +13,7 @@ from dynmap_rl.envs.scene import scene_seed
 from dynmap_rl.envs.task import Task
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
-from dynmap_rl.envs.world import ACTION_LIMIT, EPISODE_STEPS, World
+from dynmap_rl.envs.world import EPISODE_STEPS, LARGEST_CHANGE, World, limit_actions
 from dynmap_rl.experts.network import list_checkpoints, load_expert
 
 KEYS = [
@@ -22,8 +22,11 @@ KEYS = [
     "goal",
     "dynamics",
     "action",
+    "expert_action",
     *(("next", k) for k in ("reward", "done", "is_success", "dropped", "position_error")),
 ]
+
+PUSH = 0.2  # largest acceleration of a push, as a share of the cart's limit
 
 
 @dataclass(frozen=True)
@@ -33,10 +36,10 @@ class Plan:
     Attributes:
         scene_seed: seed of the scene.
         checkpoint: the expert's checkpoint.
-        noise: standard deviation of the noise on the expert's acceleration, in units of its own exploration.
+        noise: standard deviation of the noise on the expert's acceleration, in units of the cart's limit.
         detours: number of other goals that the expert is sent to before the scene's goal.
-        pushes: spans ``(start, end)`` of steps in which a push towards a random velocity, or to a stop, acts in the
-            place of the expert, so that the demonstration shows how to recover. Imitation leaves these steps out.
+        pushes: spans ``(start, end)`` of steps in which a push, a random acceleration, acts in the place of the expert,
+            so that the demonstration shows how to recover.
     """
 
     scene_seed: int
@@ -49,7 +52,9 @@ class Plan:
 def plan_demonstrations(
     task: str, split: str, start: int, count: int, expert: str | Path | None = None
 ) -> list[Plan]:
-    """Plan demonstrations with the checkpoints in turn; two of three episodes have pushes.
+    """Plan demonstrations with the checkpoints in turn; two of three episodes have noise, one of three pushes too.
+
+    Noise and pushes lead to states from which the expert must recover, as a student will have to.
 
     Args:
         task: name of the task.
@@ -62,8 +67,9 @@ def plan_demonstrations(
     plans = []
     for i in range(start, start + count):
         seed = scene_seed(split, i)
-        pushes = _draw_pushes(seed, get_task(task).pushes) if i % 3 else ()
-        plans.append(Plan(seed, checkpoints[i % len(checkpoints)], pushes=pushes))
+        pushes = _draw_pushes(seed, get_task(task).pushes) if i % 3 == 1 else ()
+        checkpoint = checkpoints[(i // 3) % len(checkpoints)]
+        plans.append(Plan(seed, checkpoint, noise=(0.0, 0.1, 0.2)[i % 3], pushes=pushes))
     return plans
 
 
@@ -81,7 +87,7 @@ def plan_exploration(
     """
     checkpoints = list_checkpoints(expert or task)
     return [
-        Plan(scene_seed(split, i), checkpoints[i % len(checkpoints)], noise=(0.5, 1.0, 2.0)[i % 3], detours=3)
+        Plan(scene_seed(split, i), checkpoints[i % len(checkpoints)], noise=(0.1, 0.2, 0.4)[i % 3], detours=3)
         for i in range(start, start + count)
     ]
 
@@ -95,8 +101,8 @@ def roll_out(task: str, plans: list[Plan], expert: str | Path | None = None) -> 
         expert: folder or task of the checkpoints that the plans name; by default the expert that ships for the task.
 
     Returns:
-        ``[E, 120]`` with ``pixels``, ``agent_pos``, ``goal``, ``dynamics``, ``action`` as executed, and under ``next``
-        ``reward``, ``done``, ``is_success``, ``dropped``, ``position_error``.
+        ``[E, 120]`` with ``pixels``, ``agent_pos``, ``goal``, ``dynamics``, ``action`` as executed, ``expert_action``
+        without noise and pushes, and under ``next`` ``reward``, ``done``, ``is_success``, ``dropped``, ``position_error``.
     """
     n = len(plans)
     env = DynmapBatchedEnv(task, n, from_pixels=True)
@@ -109,12 +115,15 @@ def roll_out(task: str, plans: list[Plan], expert: str | Path | None = None) -> 
         state = td["state"].clone()
         for row in np.flatnonzero(~np.isnan(detours[:, t, 0])):
             state[row] = torch.from_numpy(_state_for(env.task, env.worlds[row], detours[row, t]))
-        acceleration = _expert_acceleration(state, plans, networks, rngs)
+        acceleration = _expert_acceleration(state, plans, networks)
         action = np.stack([w.action_for(a) for w, a in zip(env.worlds, acceleration, strict=True)])
-        _push(t, action, plans)
+        expert_action = limit_actions(env.worlds, action)
+        _add_noise(action, plans, rngs)
+        _push(t, action, plans, env.worlds)
         td = env.step(td.set("action", torch.from_numpy(action.astype(np.float32))))
         executed = np.stack([w.action for w in env.worlds]).astype(np.float32)
         td["action"] = torch.from_numpy(executed)
+        td["expert_action"] = torch.from_numpy(expert_action.astype(np.float32))
         steps.append(td.select(*KEYS))
         td = td["next"]
     return torch.stack(steps, 1)
@@ -137,23 +146,27 @@ def _state_for(task: Task, world: World, goal: np.ndarray) -> np.ndarray:
     return state
 
 
-def _expert_acceleration(state, plans, networks, rngs) -> np.ndarray:
+def _expert_acceleration(state, plans, networks) -> np.ndarray:
     # Row by row: on some CPUs the last bits of a product of matrices depend on the number of rows, and an episode must
     # be the same in any batch.
     out = np.empty((len(plans), 3))
     for row, plan in enumerate(plans):
-        mean, std = (values.numpy() for values in networks[plan.checkpoint](state[row]))
-        out[row] = mean + plan.noise * std * rngs[row].standard_normal(3)
+        out[row] = networks[plan.checkpoint](state[row])[0].numpy()
     return out
 
 
-def _push(t: int, action: np.ndarray, plans: list[Plan]) -> None:
-    """Replace actions by pushes; every other push brings the cart to a stop."""
+def _add_noise(action: np.ndarray, plans: list[Plan], rngs) -> None:
+    for row, plan in enumerate(plans):
+        action[row] += plan.noise * LARGEST_CHANGE * rngs[row].standard_normal(3)
+
+
+def _push(t: int, action: np.ndarray, plans: list[Plan], worlds: list[World]) -> None:
+    """Replace actions by pushes, each a constant acceleration that the expert can make up for."""
     for row, plan in enumerate(plans):
         for number, (start, end) in enumerate(plan.pushes):
             if start <= t < end:
                 rng = np.random.default_rng([plan.scene_seed, 3, number])
-                action[row] = rng.uniform(-ACTION_LIMIT, ACTION_LIMIT) * (number % 2)
+                action[row] = worlds[row].action + PUSH * LARGEST_CHANGE * rng.uniform(-1, 1, 3)
 
 
 def _draw_pushes(scene_seed: int, number: int) -> tuple[tuple[int, int], ...]:

@@ -16,7 +16,7 @@ from dynmap_rl.data.normalization import normalization_constants
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.keys import NEEDED
 
-DISTURBED = "disturbed"
+DISTURBED, EXPERT_ACTION = "disturbed", "expert_action"
 
 
 def read_columns(root: str | Path) -> TensorDict:
@@ -28,8 +28,8 @@ def read_columns(root: str | Path) -> TensorDict:
     Returns:
         ``[N]``, the frames on this machine: ``index`` ``[N]``, LeRobot's number of the frame, which increases;
         ``action`` ``[N, 3]``, ``goal`` ``[N, 2]``, ``("dynamics", "position" | "velocity" | "acceleration")``
-        ``[N, 6]`` in SI units, and ``disturbed`` bool ``[N, 1]``, the steps in which a push acted; false without such a
-        column.
+        ``[N, 6]`` in SI units, ``disturbed`` bool ``[N, 1]``, the steps in which a push acted; false without such a
+        column, and ``expert_action`` ``[N, 3]``, where the dataset has it.
 
     Raises:
         ValueError: columns are missing, numbers are not finite, or the files are not on this machine.
@@ -46,8 +46,7 @@ def read_columns(root: str | Path) -> TensorDict:
         raise ValueError(
             f"{root} must have the columns {', '.join(sorted(missing))}; record a dataset with recipes/collect.py"
         )
-    if DISTURBED in info["features"]:
-        columns[DISTURBED] = DISTURBED
+    columns |= {name: name for name in (DISTURBED, EXPERT_ACTION) if name in info["features"]}
     table = pa.concat_tables([read_file(file, ["index", *columns.values()]) for file in files]).sort_by(
         "index"
     )

@@ -26,10 +26,11 @@ class DynmapConfig(PreTrainedConfig):
         kind: ``recurrent`` or ``feedforward`` policy.
         latent_size: Z of the world model.
         hidden_size: H of the world model.
-        keypoints: add spatial-softmax keypoints to the encoder.
+        architecture: ``attention`` or ``plain`` (see :class:`dynmap_rl.modules.WorldModel`).
         width: width of the policy; 0 for its default.
         window_steps: steps of a training window.
         rgb_steps: decoded frames of a window.
+        rarity: weight of rare colours in the RGB loss.
         beta_z: weight of the latent loss.
         beta_dynamics: weight of the loss of every supervised quantity.
         beta_joint: weight of the policy's loss.
@@ -51,10 +52,11 @@ class DynmapConfig(PreTrainedConfig):
     kind: str = "recurrent"
     latent_size: int = 64
     hidden_size: int = 128
-    keypoints: bool = False
+    architecture: str = "attention"
     width: int = 0
     window_steps: int = 48
     rgb_steps: int = 16
+    rarity: float = 0.75
     beta_z: float = 0.1
     beta_dynamics: float = 1.0
     beta_joint: float = 1.0

@@ -49,7 +49,7 @@ def export_to_lerobot(run: str | Path, folder: str | Path, seed: int = 0) -> Pat
         kind="recurrent" if isinstance(policy, RecurrentPolicy) else "feedforward",
         latent_size=world_model.latent_size,
         hidden_size=world_model.hidden_size,
-        keypoints=world_model.keypoints,
+        architecture=world_model.architecture,
         width=policy.width,
         input_features={
             CAMERA: PolicyFeature(FeatureType.VISUAL, (FRAME_SHAPE[2], *FRAME_SHAPE[:2])),

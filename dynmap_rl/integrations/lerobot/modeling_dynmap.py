@@ -56,11 +56,11 @@ class DynmapPolicy(PreTrainedPolicy):
             config.task = task or config.task
             config.source = {"task": config.task, "training": "joint"} if config.task else None
             # Buffers, to be on the model's device, but no part of a checkpoint.
-            for name in ("index", "disturbed"):
-                self.register_buffer(name, columns[name], persistent=False)
+            for name in ("index", "disturbed", "expert_action"):
+                self.register_buffer(name, columns.get(name, None), persistent=False)
             for name in DYNAMICS:
                 self.register_buffer(name, columns["dynamics", name], persistent=False)
-        sizes = config.latent_size, config.hidden_size, config.keypoints
+        sizes = config.latent_size, config.hidden_size, config.architecture
         self.world_model = make_world_model(constants, parse_supervision(config.supervision), *sizes)
         width = {"width": config.width} if config.width else {}
         self.policy = make_policy(constants, config.kind, self.world_model, **width)
@@ -81,7 +81,11 @@ class DynmapPolicy(PreTrainedPolicy):
             windows = self._augment(windows)
         config = self.config
         world_model_loss = WorldModelLoss(
-            self.world_model, config.beta_z, config.beta_dynamics, rgb_steps=config.rgb_steps
+            self.world_model,
+            config.beta_z,
+            config.beta_dynamics,
+            rarity=config.rarity,
+            rgb_steps=config.rgb_steps,
         )
         # As an attribute, the loss module would save all weights a second time.
         loss_module = JointLoss(world_model_loss, self.policy, config.beta_joint, config.emphasis)
@@ -93,8 +97,8 @@ class DynmapPolicy(PreTrainedPolicy):
         """Convert a batch of LeRobot's loader to the input of the losses.
 
         Returns:
-            ``[B, T]`` with ``pixels``, ``action``, ``goal``, ``dynamics``, ``disturbed``, and a mask that is false
-            beyond the end of an episode.
+            ``[B, T]`` with ``pixels``, ``action``, ``goal``, ``dynamics``, ``disturbed``, ``expert_action`` where
+            the dataset has it, and a mask that is false beyond the end of an episode.
 
         Raises:
             ValueError: the policy was made without a dataset.
@@ -116,6 +120,8 @@ class DynmapPolicy(PreTrainedPolicy):
             "disturbed": self.disturbed[rows],
             ("collector", "mask"): ~beyond,
         }
+        if self.expert_action is not None:
+            data["expert_action"] = self.expert_action[rows]
         return TensorDict(data, action.shape[:2], device=action.device)
 
     def _augment(self, windows: TensorDict) -> TensorDict:
