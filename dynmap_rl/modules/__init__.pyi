@@ -8,10 +8,10 @@ from .checkpoints import make_policy as make_policy
 from .checkpoints import make_world_model as make_world_model
 from .checkpoints import save_policy as save_policy
 from .checkpoints import save_world_model as save_world_model
-from .decoder import BlobDecoder as BlobDecoder
 from .decoder import DynamicsDecoder as DynamicsDecoder
 from .decoder import PlainDecoder as PlainDecoder
-from .encoder import AttentionEncoder as AttentionEncoder
+from .decoder import SpriteDecoder as SpriteDecoder
+from .encoder import GlimpseEncoder as GlimpseEncoder
 from .encoder import PlainEncoder as PlainEncoder
 from .normalization import Normalizer as Normalizer
 from .policy import FeedforwardPolicy as FeedforwardPolicy

@@ -17,7 +17,7 @@ POLICIES = {"feedforward": FeedforwardPolicy, "recurrent": RecurrentPolicy}
 
 
 def make_world_model(
-    constants: dict, supervision: tuple[str, ...], latent_size=64, hidden_size=128, architecture="attention"
+    constants: dict, supervision: tuple[str, ...], latent_size=64, hidden_size=128, architecture="glimpse"
 ) -> WorldModel:
     """Make a world model with random weights.
 

@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from dynmap_rl.keys import DYNAMICS
 
-from .layers import BLOCK, make_grid, up
+from .layers import BLOCK, hat_kernels, up
 from .normalization import Normalizer
 
 
@@ -42,68 +42,59 @@ class PlainDecoder(nn.Module):
         return F.pixel_shuffle(blocks, BLOCK).unflatten(0, x.shape[:-1]) + 0.5
 
 
-class BlobDecoder(nn.Module):
-    """Blobs at predicted places, to masks of a few predicted colours.
+class SpriteDecoder(PlainDecoder):
+    """Plain CNN with sprites before it: small images with transparency, drawn at predicted places.
 
-    An MLP places K blobs (Gaussian bells along x and y), each with a feature vector; their sum is a map of 32 x 32.
-    Two convolutions turn it into one logit for each pixel and colour. The frame is the mean of M predicted colours,
-    weighted by the softmax of the logits. Places and colours are outputs of an MLP, so that moving or recolouring an
-    object changes few numbers and not a filter for every place.
+    The counterpart of :class:`~dynmap_rl.modules.GlimpseEncoder`, as the writing half of DRAW (Gregor et al. 2015).
+    Moving an object changes two numbers and not a filter for every place, and each pixel of a sprite has a colour of
+    its own from the start. What is not in a sprite is left to the CNN.
 
     Args:
         input_size: Z + 2 H.
-        blobs: K.
-        features: entries of a blob's feature vector.
-        colors: M.
-        width: width of the MLPs.
-        channels: channels between the convolutions.
+        sprites: number of sprites; later ones cover earlier ones.
+        side: side of a sprite, in pixels.
+        width: width of the MLP that paints the sprites.
+        channels: channels of the CNN's maps of stride 8 and 4.
     """
 
     def __init__(
         self,
         input_size: int,
-        blobs: int = 16,
-        features: int = 16,
-        colors: int = 6,
+        sprites: int = 2,
+        side: int = 24,
         width: int = 256,
-        channels: int = 16,
+        channels: tuple[int, int] = (64, 32),
     ):
-        super().__init__()
-        self.sizes = 2, 2, features
-        self.blobs = nn.Sequential(
-            nn.Linear(input_size, width), nn.SiLU(), nn.Linear(width, blobs * (4 + features))
+        super().__init__(input_size, channels)
+        self.sprites, self.side = sprites, side
+        self.place = nn.Linear(input_size, sprites * 2)
+        nn.init.normal_(self.place.weight, std=0.05)
+        nn.init.uniform_(self.place.bias, -0.3, 0.3)
+        self.paint = nn.Sequential(
+            nn.Linear(input_size, width), nn.SiLU(), nn.Linear(width, sprites * 4 * side**2)
         )
-        self.places = nn.Linear(input_size, 2 * blobs)
-        nn.init.normal_(self.places.weight, std=0.05)
-        nn.init.uniform_(self.places.bias, -0.6, 0.6)
-        self.background = nn.Linear(input_size, features)
-        self.colors = nn.Sequential(nn.Linear(input_size, width), nn.SiLU(), nn.Linear(width, 3 * colors))
-        self.masks = nn.Sequential(
-            nn.Conv2d(features + 2, channels, 3, 1, 1), nn.ReLU(), nn.Conv2d(channels, 4 * colors, 1)
-        )
-        self.register_buffer("grid", make_grid(32).permute(2, 0, 1))  # (2, 32, 32)
+        self.tint = nn.Linear(input_size, sprites * 3)
 
     def forward(
         self, predicted_latent: torch.Tensor, hidden1: torch.Tensor, hidden2: torch.Tensor
     ) -> torch.Tensor:
         """Decode ``[..., Z]`` and ``[..., H]`` twice to frames ``[..., 3, 64, 64]``, about 0..1."""
+        frames = super().forward(predicted_latent, hidden1, hidden2).float().flatten(0, -4)
+        frames = frames.transpose(1, 2)  # (N, 64, 3, 64): rows first
         x = torch.cat([predicted_latent, hidden1, hidden2], -1)
         shape, x = x.shape[:-1], x.flatten(0, -2)
-        count = len(x)
-        move, sharpness, features = (
-            self.blobs(x).float().view(count, -1, sum(self.sizes)).split(self.sizes, -1)
-        )
-        center = move + self.places(x).float().view(count, -1, 2)  # (N, K, 2)
-        line = self.grid[0, 0]
-        bells = ((line - center[..., None]) * (sharpness + 1.5).exp()[..., None]).square().mul(-0.5).exp()
-        across, down = bells.unbind(2)  # (N, K, 32)
-        rows = torch.einsum("nkc,nky->ncyk", features, down)
-        maps = rows @ across[:, None] + self.background(x).float()[..., None, None]  # (N, C, 32, 32)
-        maps = torch.cat([maps, self.grid.expand(count, -1, -1, -1)], 1)
-        masks = F.pixel_shuffle(self.masks(maps.contiguous(memory_format=torch.channels_last)), 2)
-        colors = self.colors(x).float().view(count, -1, 3)
-        frames = colors.transpose(1, 2) @ masks.float().flatten(2).softmax(1)  # (N, 3, 4096)
-        return frames.view(*shape, 3, 64, 64) + 0.5
+        count, side = len(x), self.side
+        sprites = self.paint(x).float().view(count, self.sprites, side, 4, side)
+        opacity = (4 * sprites[..., 3:, :] - 2).sigmoid()
+        color = sprites[..., :3, :] + self.tint(x).float().view(count, self.sprites, 1, 3, 1) + 0.5
+        sprites = torch.cat([opacity * color, opacity], -2)  # (N, S, side, 4, side)
+        place = self.place(x).float().view(count, self.sprites, 2)
+        across, down = hat_kernels(place, side).unbind(2)  # (N, S, side, 64)
+        rows = down.mT @ sprites.flatten(3)  # (N, S, 64, 4 * side)
+        drawn = rows.unflatten(3, (4, side)).flatten(2, 3) @ across  # (N, S, 64 * 4, 64)
+        for sprite in drawn.unflatten(2, (64, 4)).unbind(1):
+            frames = frames * (1 - sprite[:, :, 3:]) + sprite[:, :, :3]
+        return frames.transpose(1, 2).reshape(*shape, 3, 64, 64)
 
 
 class DynamicsDecoder(nn.Module):

@@ -6,7 +6,7 @@ import torch
 from torch import nn
 from torch.nn import functional as F
 
-from .layers import BLOCK, ChannelNorm, down, make_grid, same, to_blocks
+from .layers import BLOCK, ChannelNorm, color_weights, down, hat_kernels, make_grid, same, to_blocks
 
 
 class Encoder(nn.Module):
@@ -63,20 +63,25 @@ class PlainEncoder(Encoder):
         return self.project(y.flatten(1)) + 5 * self.color(color)  # (N, Z); mean colours differ little
 
 
-class AttentionEncoder(Encoder):
-    """Positions, colours and features at the places that K learned attention maps look at.
+class GlimpseEncoder(Encoder):
+    """What K learned attention maps look at, and the frame as seen from the places where the first G of them look.
 
-    Convolutions on blocks of 4 x 4 pixels, with the context of maps of 8 x 8 added, end in K attention maps of 32 x 32.
-    Each map pools its expected position (spatial softmax, Levine et al. 2016), the frame's mean colour there, and
-    learned features. So the position of an object reaches the latent to a fraction of a pixel, and its colour without
-    a detour through filters.
+    Convolutions on blocks of 4 x 4 pixels, with the context of maps of 8 x 8 added, end in attention maps of 32 x 32,
+    to which rare colours of the frame are brighter than frequent ones. Each map pools its expected position (spatial
+    softmax, Levine et al. 2016), the frame's mean colour there, and learned features. Around the positions of the first
+    G maps, the encoder reads glimpses: small images that move with the map, as in DRAW (Gregor et al. 2015). In a
+    glimpse an object stands at the same place wherever it is in the frame, so that a linear map finds its parts, their
+    colours and its tilt.
 
     Args:
         latent_size: Z.
         channels: channels of the maps of stride 4 and 8.
         maps: K.
         features: learned features of each map.
-        width: width of the MLP from the pooled values to the latent.
+        glimpses: G.
+        samples: samples of a glimpse along each axis.
+        spacing: distance of the samples, in pixels.
+        width: width of the MLPs from the pooled values to the latent.
     """
 
     def __init__(
@@ -85,19 +90,23 @@ class AttentionEncoder(Encoder):
         channels: tuple[int, int] = (32, 48),
         maps: int = 16,
         features: int = 8,
+        glimpses: int = 2,
+        samples: int = 16,
+        spacing: float = 1.5,
         width: int = 256,
     ):
         super().__init__()
         c1, c2 = channels
-        self.maps = maps
+        self.maps, self.glimpses, self.samples, self.spacing = maps, glimpses, samples, spacing
         self.stem = nn.Conv2d(3 * BLOCK**2, c1, 1)
         self.mix = nn.Sequential(nn.Conv2d(c1, c1, 3, 1, 1), ChannelNorm(c1))
         self.context = nn.Sequential(down(c1, c2), same(c2), nn.Conv2d(c2, c1, 1))
         self.attend = nn.Conv2d(c1, SUB**2 * maps, 1)
         self.features = nn.Conv2d(c1, features, 1)
         pooled = maps * (2 + 3 + features) + 3
-        self.mlp = nn.Sequential(nn.Linear(pooled, width), nn.SiLU(), nn.Linear(width, latent_size))
-        self.linear = nn.Linear(pooled, latent_size)
+        self.read = nn.Sequential(nn.Linear(glimpses * 3 * samples**2, width), nn.SiLU())
+        self.mlp = nn.Sequential(nn.Linear(pooled + width, width), nn.SiLU(), nn.Linear(width, latent_size))
+        self.linear = nn.Linear(pooled + width, latent_size)
         # Constant products in the place of sums over strided memory, which are several times as slow.
         self.register_buffer("places", _sub_blocks(make_grid(32)))  # (1024, 2)
         self.register_buffer("average", _averages())  # (48, 4 * 3)
@@ -112,17 +121,38 @@ class AttentionEncoder(Encoder):
         h = (h + F.interpolate(self.context(h.relu()), scale_factor=2)).relu()
         # In channels-last memory the next lines only change the view.
         logits = self.attend(h).permute(0, 2, 3, 1).reshape(count, -1, self.maps)  # (N, 1024, K)
-        attention = logits.float().softmax(1)
+        attention = (logits.float() + _rarity(x)).softmax(1)
         colors = (blocks.permute(0, 2, 3, 1).reshape(count, 256, -1).float() @ self.average).view(
             count, -1, 3
         )
+        mean = colors.mean(1)
         values = torch.cat([self.places.expand(count, -1, -1), colors], -1)
-        where = attention.transpose(1, 2) @ (2 * values)  # (N, K, 5)
+        where = attention.transpose(1, 2) @ values  # (N, K, 5)
         of_blocks = attention.view(count, 256, -1) @ self.gather  # (N, 256, K)
         features = self.features(h).permute(0, 2, 3, 1).reshape(count, 256, -1).float()
         what = of_blocks.transpose(1, 2) @ features  # (N, K, features)
-        pooled = torch.cat([where.flatten(1), what.flatten(1), 3 * colors.mean(1)], -1)
+        glimpses = self.look(x.float(), where[:, : self.glimpses, :2], 255 * (mean + 0.5)) / 255
+        values = 2 * where.flatten(1), what.flatten(1), 3 * mean, self.read(2 * glimpses.flatten(1))
+        pooled = torch.cat(values, -1)
         return self.mlp(pooled) + self.linear(pooled)
+
+    def look(self, x: torch.Tensor, centers: torch.Tensor, background: torch.Tensor) -> torch.Tensor:
+        """Read glimpses of frames ``[N, 3, 64, 64]``.
+
+        Args:
+            x: frames.
+            centers: ``[N, G, 2]`` in -1..1.
+            background: colours ``[N, 3]`` to subtract inside the frames; outside, a glimpse is 0.
+
+        Returns:
+            ``[N, G, S, 3, S]``, rows first.
+        """
+        across, down = hat_kernels(centers, self.samples, self.spacing).unbind(2)  # (N, G, S, 64)
+        rows = down.flatten(1, 2) @ x.transpose(1, 2).flatten(2)  # (N, G S, 3 * 64)
+        rows = rows.view(*centers.shape[:2], -1, 64)  # (N, G, S * 3, 64)
+        seen = (rows @ across.mT).unflatten(2, (-1, 3))
+        inside = down.sum(-1)[..., None, None] * across.sum(-1)[:, :, None, None]  # (N, G, S, 1, S)
+        return seen - inside * background[:, None, None, :, None]
 
 
 SUB = 2  # attention maps have SUB x SUB places in a block
@@ -139,3 +169,10 @@ def _averages() -> torch.Tensor:
     part = torch.arange(BLOCK) // side
     here = F.one_hot(SUB * part[:, None] + part, SUB**2).flatten(0, 1) / side**2  # (16, SUB**2)
     return torch.einsum("pq,cd->cpqd", here, torch.eye(3)).reshape(3 * BLOCK**2, -1)
+
+
+@torch.no_grad()
+def _rarity(x: torch.Tensor) -> torch.Tensor:
+    """Return the logarithm of the mean rarity of the colours at the places of a map, ``[N, 1024, 1]``."""
+    weights = F.avg_pool2d(color_weights(x, 0.75)[:, None], BLOCK // SUB)  # (N, 1, 32, 32)
+    return F.pixel_unshuffle(weights, SUB).permute(0, 2, 3, 1).reshape(len(x), -1, 1).log()

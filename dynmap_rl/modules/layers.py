@@ -30,6 +30,47 @@ def make_grid(size: int) -> torch.Tensor:
     return torch.stack([x, y], -1)
 
 
+def hat_kernels(centers: torch.Tensor, count: int, spacing: float = 1.0) -> torch.Tensor:
+    """Return kernels that read or write ``count`` samples, ``spacing`` pixels apart, along an axis of 64 pixels.
+
+    A kernel is a triangle over the pixels around its sample, so that reading and writing are linear interpolation and
+    have a gradient with respect to the centre. Samples outside the frame have less weight, or none.
+
+    Args:
+        centers: middles of the samples, ``[...]``, in -1..1 from edge to edge.
+        count: number of samples.
+        spacing: distance of the samples in pixels, 1 or more.
+
+    Returns:
+        ``[..., count, 64]``; the sum over the pixels is 1 inside the frame.
+    """
+    steps = (torch.arange(count, device=centers.device) - (count - 1) / 2) * spacing
+    pixels = torch.arange(64, device=centers.device) + 0.5
+    samples = (centers[..., None] + 1) * 32 + steps
+    return (1 - (pixels - samples[..., None]).abs() / spacing).clamp_min(0) / spacing
+
+
+def color_weights(pixels: torch.Tensor, power: float) -> torch.Tensor:
+    """Return weights of pixels that fall with the frequency of their colour in the frame; their mean is 1.
+
+    Colours count as equal if the upper four bits of their channels are.
+
+    Args:
+        pixels: frames ``[..., 3, H, W]`` in 0..255.
+        power: a weight is the number of pixels of the colour to the power of ``-power``. With 1, every colour of a
+            frame has the same share.
+
+    Returns:
+        ``[..., H, W]``.
+    """
+    red, green, blue = (pixels.byte() >> 4).flatten(0, -4).flatten(2).unbind(1)  # (N, H W)
+    color = ((red.short() << 8) | (green << 4) | blue).long()
+    count = torch.zeros(len(color), 4096, device=color.device)
+    count.scatter_add_(1, color, torch.ones_like(color, dtype=count.dtype))
+    weight = count.gather(1, color).pow(-power)
+    return (weight / weight.mean(1, keepdim=True)).view(*pixels.shape[:-3], *pixels.shape[-2:])
+
+
 class ChannelNorm(nn.Module):
     """LayerNorm over the channels of every pixel, ``[N, C, H, W]``.
 

@@ -7,14 +7,14 @@ from collections.abc import Mapping
 import torch
 from torch import nn
 
-from .decoder import BlobDecoder, DynamicsDecoder, PlainDecoder
-from .encoder import AttentionEncoder, PlainEncoder
+from .decoder import DynamicsDecoder, PlainDecoder, SpriteDecoder
+from .encoder import GlimpseEncoder, PlainEncoder
 from .normalization import Normalizer
 from .precision import mixed_precision
 from .recurrent import State
 from .transition import Transition
 
-ARCHITECTURES = {"plain": (PlainEncoder, PlainDecoder), "attention": (AttentionEncoder, BlobDecoder)}
+ARCHITECTURES = {"plain": (PlainEncoder, PlainDecoder), "glimpse": (GlimpseEncoder, SpriteDecoder)}
 
 
 class WorldModel(nn.Module):
@@ -25,8 +25,8 @@ class WorldModel(nn.Module):
         dynamics: normaliser of each supervised quantity: any of position, velocity, acceleration, or none.
         latent_size: Z.
         hidden_size: H.
-        architecture: ``plain``, the paper's plain CNNs (:class:`PlainEncoder`, :class:`PlainDecoder`), or ``attention``
-            (:class:`AttentionEncoder`, :class:`BlobDecoder`).
+        architecture: ``plain``, the paper's plain CNNs (:class:`PlainEncoder`, :class:`PlainDecoder`), or ``glimpse``
+            (:class:`GlimpseEncoder`, :class:`SpriteDecoder`).
 
     Raises:
         ValueError: the architecture is unknown.
@@ -38,7 +38,7 @@ class WorldModel(nn.Module):
         dynamics: Mapping[str, Normalizer],
         latent_size: int = 64,
         hidden_size: int = 128,
-        architecture: str = "attention",
+        architecture: str = "glimpse",
     ):
         super().__init__()
         if architecture not in ARCHITECTURES:

@@ -10,6 +10,7 @@ from tensordict.nn import dispatch
 from tensordict.utils import NestedKey, unravel_key
 from torchrl.objectives.common import LossModule
 
+from dynmap_rl.modules.layers import color_weights
 from dynmap_rl.modules.world_model import WorldModel
 
 
@@ -130,28 +131,6 @@ class WorldModelLoss(LossModule):
         if self.rarity:
             error = error * color_weights(pixels, self.rarity)
         return self._mean((error.mean((-2, -1)) + 1e-8).sqrt(), masks)
-
-
-@torch.no_grad()
-def color_weights(pixels: torch.Tensor, power: float) -> torch.Tensor:
-    """Return weights of pixels that fall with the frequency of their colour in the frame; their mean is 1.
-
-    Colours count as equal if the upper four bits of their channels are.
-
-    Args:
-        pixels: frames uint8 ``[..., 3, H, W]``.
-        power: a weight is the number of pixels of the colour to the power of ``-power``. With 1, every colour of a
-            frame has the same share.
-
-    Returns:
-        ``[..., H, W]``.
-    """
-    red, green, blue = (pixels >> 4).long().flatten(0, -4).flatten(2).unbind(1)  # (N, H W)
-    color = (red << 8) | (green << 4) | blue
-    count = torch.zeros(len(color), 4096, device=color.device)
-    count.scatter_add_(1, color, torch.ones_like(color, dtype=count.dtype))
-    weight = count.gather(1, color).pow(-power)
-    return (weight / weight.mean(1, keepdim=True)).view(*pixels.shape[:-3], *pixels.shape[-2:])
 
 
 def rms(x: torch.Tensor) -> torch.Tensor:

@@ -15,12 +15,12 @@ class WorldModelArchitecture:
 
     # Dynamics that the world model predicts: any of position,velocity,acceleration, or none (Only-RGB).
     supervision: str = "position,velocity"
-    # attention (positions and colours where attention maps look, blobs to masks of a few colours), or the paper's plain
-    # CNNs.
-    architecture: str = "attention"
+    # glimpse (small images that move with attention maps, read by the encoder and drawn by the decoder), or the paper's
+    # plain CNNs.
+    architecture: str = "glimpse"
 
     def __post_init__(self):
-        check_choice(self, "architecture", ("attention", "plain"))
+        check_choice(self, "architecture", ("glimpse", "plain"))
         for name in self.supervision.split(","):
             if name.strip() not in ("none", *DYNAMICS) or (
                 "none" in self.supervision and "," in self.supervision

@@ -25,7 +25,7 @@ from dynmap_rl.utils.files import read_json, write_json
 from dynmap_rl.utils.weights import fingerprint
 
 
-def make_run(folder, kind, architecture="attention", goal=2):
+def make_run(folder, kind, architecture="glimpse", goal=2):
     sizes = {"action": 3, "goal": goal, "position": 6}
     meta = {name: {"low": [-1.0] * n, "high": [2.0] * n} for name, n in sizes.items()}
     world_model = make_world_model(meta, ("position",), 16, 24, architecture)
@@ -35,7 +35,7 @@ def make_run(folder, kind, architecture="attention", goal=2):
     return world_model, policy
 
 
-@pytest.mark.parametrize(("kind", "architecture"), [("recurrent", "attention"), ("feedforward", "plain")])
+@pytest.mark.parametrize(("kind", "architecture"), [("recurrent", "glimpse"), ("feedforward", "plain")])
 def test_a_run_exports_to_lerobot_and_back(tmp_path, kind, architecture):
     run, exported, back = tmp_path / "run", tmp_path / "pretrained_model", tmp_path / "back"
     world_model, policy = make_run(run, kind, architecture)

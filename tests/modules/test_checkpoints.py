@@ -19,7 +19,7 @@ from dynmap_rl.modules.world_model import WorldModel
 from dynmap_rl.utils.weights import fingerprint
 
 
-@pytest.mark.parametrize(("kind", "architecture"), [("recurrent", "attention"), ("feedforward", "plain")])
+@pytest.mark.parametrize(("kind", "architecture"), [("recurrent", "glimpse"), ("feedforward", "plain")])
 def test_checkpoints_are_complete(tmp_path, kind, architecture):
     model = make_world_model(CONSTANTS, ("position",), 16, 24, architecture)
     policy = make_policy(CONSTANTS, kind, model, width=20)

@@ -4,11 +4,11 @@ import pytest
 import torch
 from torch.nn.functional import pixel_shuffle, pixel_unshuffle
 
-from dynmap_rl.modules.encoder import AttentionEncoder, PlainEncoder
+from dynmap_rl.modules.encoder import GlimpseEncoder, PlainEncoder
 from dynmap_rl.modules.layers import to_blocks
 
 
-@pytest.mark.parametrize("make", [AttentionEncoder, PlainEncoder])
+@pytest.mark.parametrize("make", [GlimpseEncoder, PlainEncoder])
 def test_encoder_keeps_leading_axes_and_refuses_other_frames(make):
     encoder = make(16)
     frames = torch.randint(0, 256, (2, 3, 3, 64, 64), dtype=torch.uint8)
@@ -20,7 +20,7 @@ def test_encoder_keeps_leading_axes_and_refuses_other_frames(make):
         encoder(torch.zeros(1, 3, 32, 32))
 
 
-@pytest.mark.parametrize("make", [AttentionEncoder, PlainEncoder])
+@pytest.mark.parametrize("make", [GlimpseEncoder, PlainEncoder])
 @torch.no_grad()
 def test_chunks_of_many_frames_have_the_latents_of_one_batch(make):
     encoder = make(16)
@@ -62,7 +62,7 @@ def test_a_frame_s_scale_and_colour_reach_the_latent():
 @torch.no_grad()
 def test_attention_reads_position_and_colour_of_the_place_it_looks_at():
     """A map that looks at dark blocks alone finds where the dark block is, and its colour."""
-    encoder = AttentionEncoder(16, maps=1)
+    encoder = GlimpseEncoder(16, maps=1, glimpses=1, samples=4, spacing=1.0)
     frames = torch.full((1, 3, 64, 64), 255, dtype=torch.uint8)
     frames[0, :, 8:12, 40:44] = torch.tensor([30, 60, 90], dtype=torch.uint8)[:, None, None]
     attend = encoder.attend.register_forward_hook(
@@ -77,3 +77,7 @@ def test_attention_reads_position_and_colour_of_the_place_it_looks_at():
     x, y, *color = (seen[0][:5] / 2).tolist()
     assert (x, y) == pytest.approx((42 / 32 - 1, 10 / 32 - 1), abs=1e-5)
     assert color == pytest.approx([v / 255 - 0.5 for v in (30, 60, 90)], abs=1e-5)
+    glimpse = encoder.look(
+        frames.float(), torch.tensor([[[x, y]]]), torch.zeros(1, 3)
+    )  # rows, channels, columns
+    assert (glimpse[0, 0].movedim(1, -1) == torch.tensor([30.0, 60.0, 90.0])).all()

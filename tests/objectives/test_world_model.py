@@ -7,7 +7,7 @@ from tensordict import TensorDict
 
 from dynmap_rl.keys import DYNAMICS
 from dynmap_rl.modules.checkpoints import make_world_model
-from dynmap_rl.objectives.world_model import WorldModelLoss, color_weights, rms
+from dynmap_rl.objectives.world_model import WorldModelLoss, rms
 
 CONSTANTS = CONSTANTS | {q: {"low": [-2.0] * 6, "high": [2.0] * 6} for q in DYNAMICS}
 
@@ -79,17 +79,6 @@ def test_weights_scale_their_terms():
     _, heavy = make(("position",), beta_z=2.0, beta_dynamics=3.0)
     torch.testing.assert_close(heavy(td)["loss_latent"], 2 * plain(td)["loss_latent"])
     torch.testing.assert_close(heavy(td)["loss_position"], 3 * plain(td)["loss_position"])
-
-
-def test_weights_of_colours_have_mean_one_and_fall_with_frequency():
-    pixels = torch.zeros(2, 3, 8, 8, dtype=torch.uint8)
-    pixels[:, 0, 0, :4] = 200
-    weight = color_weights(pixels, 0.5)
-    torch.testing.assert_close(weight.mean((1, 2)), torch.ones(2))
-    torch.testing.assert_close(weight[0, 0, 0] / weight[0, 5, 5], torch.tensor((60 / 4) ** 0.5))
-    equal = color_weights(pixels, 1.0)
-    torch.testing.assert_close(equal[0, 0, :4].sum(), equal[0].sum() / 2, msg="the same share of each colour")
-    torch.testing.assert_close(color_weights(pixels, 0.0), torch.ones(2, 8, 8))
 
 
 def test_rarity_makes_an_error_on_a_small_object_count():

@@ -17,7 +17,7 @@ from dynmap_rl.utils.weights import fingerprint
 
 def test_architecture_is_that_of_the_settings():
     default = build_world_model(CONSTANTS, WorldModelArchitecture("none"))
-    assert (default.supervision, default.architecture) == ((), "attention")
+    assert (default.supervision, default.architecture) == ((), "glimpse")
     model = build_world_model(CONSTANTS, WorldModelTraining(supervision="position", architecture="plain"))
     assert (model.supervision, model.architecture) == (("position",), "plain")
 

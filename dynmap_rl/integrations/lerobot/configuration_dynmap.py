@@ -26,7 +26,7 @@ class DynmapConfig(PreTrainedConfig):
         kind: ``recurrent`` or ``feedforward`` policy.
         latent_size: Z of the world model.
         hidden_size: H of the world model.
-        architecture: ``attention`` or ``plain`` (see :class:`dynmap_rl.modules.WorldModel`).
+        architecture: ``glimpse`` or ``plain`` (see :class:`dynmap_rl.modules.WorldModel`).
         width: width of the policy; 0 for its default.
         window_steps: steps of a training window.
         rgb_steps: decoded frames of a window.
@@ -52,7 +52,7 @@ class DynmapConfig(PreTrainedConfig):
     kind: str = "recurrent"
     latent_size: int = 64
     hidden_size: int = 128
-    architecture: str = "attention"
+    architecture: str = "glimpse"
     width: int = 0
     window_steps: int = 48
     rgb_steps: int = 16
