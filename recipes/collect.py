@@ -39,7 +39,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Record, report and upload."""
-    from dynmap_rl.data.demonstrations import META
+    from dynmap_rl.data.demonstrations import META, load_meta
     from dynmap_rl.data.format.hub import push_dataset
     from dynmap_rl.data.recording.record import record_dataset
     from dynmap_rl.envs.tasks import get_task
@@ -53,7 +53,9 @@ def main(config: Config) -> None:
     record_dataset(output, config.task, config.kind, *sizes, config.workers, config.expert)
     print(f"{'already complete' if complete else 'written'}: {output}")
     folder = Path("runs/collect") / output.name
-    write_dataset_page(folder, output, plain_settings(config), command_line(sys.argv))
+    said = f"{load_meta(output)['rejected']} further candidates failed and were left out"
+    print(said)
+    write_dataset_page(folder, output, plain_settings(config), command_line(sys.argv), said)
     if config.push_to_hub:
         push_dataset(output, config.push_to_hub)
         print(f"pushed: {config.push_to_hub}")

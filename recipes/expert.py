@@ -22,6 +22,9 @@ class Config:
     task: str = "balance_reaching"
     # Run folder; by default runs/expert/TASK.
     run: Path | None = None
+    # Largest acceleration of the expert, as a share of the cart's limits. Blocks tip at half of them or more, and a student
+    # needs a margin.
+    acceleration: float = 0.25
     # Training.
     ppo: PPOTraining = PPOTraining()
     # With two threads, actor and critic learn at the same time; the result is the same.
@@ -47,6 +50,8 @@ def main(config: Config) -> None:
     from dynmap_rl.utils.devices import seed_everything
     from dynmap_rl.utils.files import read_json
 
+    if not 0 < config.acceleration <= 1:
+        raise ValueError(f"--acceleration must be above 0 and at most 1, got {config.acceleration}")
     if config.threads < 1:
         raise ValueError(f"--threads must be at least 1, got {config.threads}")
     check_logger(config.logger)
@@ -58,7 +63,8 @@ def main(config: Config) -> None:
     folder = config.run or Path("runs/expert") / env.task.name
     open_run(folder, comparable, ignore=("run", "threads", "logger"))
     seed_everything(ppo.seed)
-    network = ExpertNetwork(env.task.state_size, tuple(ACCELERATION_LIMIT))
+    limit = config.acceleration * ACCELERATION_LIMIT
+    network = ExpertNetwork(env.task.state_size, tuple(limit))
 
     def judge(episodes: int) -> dict[str, float]:
         return rates(env.task, roll_out(network, env.task, fresh_scenes(episodes)))
@@ -66,7 +72,7 @@ def main(config: Config) -> None:
     facts = {
         "task": config.task,
         "state_size": env.task.state_size,
-        "acceleration_limit": ACCELERATION_LIMIT.tolist(),
+        "acceleration_limit": limit.tolist(),
         "hidden": 128,
     }
     common = {"threads": config.threads, "logger": config.logger}

@@ -5,8 +5,10 @@
 
 On held-out demonstrations with their actions, every world model that decodes positions reads a second of frames and
 predicts two more without (mm and degrees, beside a constant prediction). Linear maps from each state to position,
-velocity and acceleration are fitted to training demonstrations (R^2 on held-out ones). The folder of the results gets
-two figures, ``probe.json`` and ``report.html``.
+velocity and acceleration are fitted to training demonstrations (R^2 on held-out ones). What the world models see is
+measured on held-out demonstrations and on the expert's first ten steps in validation scenes: colours of objects and goal
+in predicted frames, and the cart's position by a linear map of the latent. The folder of the results gets two figures,
+``probe.json`` and ``report.html``.
 """
 
 import sys
@@ -42,8 +44,10 @@ class Config:
 
 def main(config: Config) -> None:
     """Measure, draw and report."""
-    from dynmap_rl.data.demonstrations import load_dataset
+    from dynmap_rl.data.demonstrations import load_dataset, load_meta
+    from dynmap_rl.envs.scene import Scene
     from dynmap_rl.evaluation.open_loop import open_loop_errors
+    from dynmap_rl.evaluation.perception import begin_scenes, color_errors, locate_cart
     from dynmap_rl.evaluation.probing import probe
     from dynmap_rl.reporting.figures import plot_open_loop, plot_probes
     from dynmap_rl.reporting.html import write_html
@@ -61,7 +65,19 @@ def main(config: Config) -> None:
         if "position" in model.supervision
     }
     probes = {name: probe(model, train, test) for name, model in models.items()}
-    text = describe(open_loop, probes, seconds=0.05 * config.horizon)
+    rows = [row for row in load_meta(dataset)["episodes"] if row["split"] == "eval"][: len(test)]
+    judged = {
+        "held-out demonstrations": (test, [Scene.from_dict(row["scene"]) for row in rows]),
+        "first ten steps": begin_scenes("balance_reaching", len(test)),
+    }
+    perception = {
+        name: {
+            where: color_errors(model, episodes, scenes) | {"cart_error": locate_cart(model, train, episodes)}
+            for where, (episodes, scenes) in judged.items()
+        }
+        for name, model in models.items()
+    }
+    text = describe(open_loop, probes, perception, seconds=0.05 * config.horizon)
     print(text)
     (config.output / "open_loop.png").unlink(missing_ok=True)  # of other --runs
     if open_loop:
@@ -70,7 +86,10 @@ def main(config: Config) -> None:
     command = command_line(sys.argv)
     write_html(config.output, "States and predictions of world models", text, command, plain_settings(config))
     facts = {"command": command, "train_episodes": len(train), "test_episodes": len(test)}
-    write_json(config.output / "probe.json", facts | {"open_loop": open_loop, "probes": probes})
+    write_json(
+        config.output / "probe.json",
+        facts | {"open_loop": open_loop, "probes": probes, "perception": perception},
+    )
     print(f"written: {config.output}")
 
 
@@ -89,13 +108,20 @@ def load_world_models(runs: list[str]) -> dict:
     return models
 
 
-def describe(open_loop: dict, probes: dict, seconds: float) -> str:
+def describe(open_loop: dict, probes: dict, perception: dict, seconds: float) -> str:
     """Return the results as lines of text."""
     lines = []
     for name, errors in open_loop.items():
         last = {key: values[-1] for key, values in errors["model"].items()}
         distances = f"cart {last['cart_mm']:.0f} mm, block {last['block_mm']:.0f} mm"
         lines.append(f"{name}: error after {seconds:.1f} s without frames: {distances}")
+    for name, places in perception.items():
+        for where, found in places.items():
+            lines.append(
+                f"{name}, {where}: colour error on objects {found['object_error']:.3f}, chroma explained "
+                f"{found['chroma_explained']:.2f}, goal explained {found['goal_explained']:.2f}, cart by a linear map "
+                f"{1000 * found['cart_error']:.1f} mm"
+            )
     for name, states in probes.items():
         for state, quantities in states.items():
             values = "  ".join(f"{q} {sum(r2) / len(r2):5.2f}" for q, r2 in quantities.items())

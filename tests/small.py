@@ -17,9 +17,9 @@ CONSTANTS = {
     "position": {"low": [0.0] * 6, "high": [1.0] * 6},
 }
 SIZES = {"updates": 6, "windows": 2, "window_steps": 5}
-WORLD_MODEL = WorldModelTraining(supervision="position", rgb_steps=2, learning_rate=1e-3, **SIZES)
+WORLD_MODEL = WorldModelTraining(supervision="position", rgb_frames=2, learning_rate=1e-3, **SIZES)
 POLICY = PolicyTraining(updates=4, batch=2, copies=1, learning_rate=1e-3)
-JOINT = JointTraining(rgb_steps=2, **SIZES)
+JOINT = JointTraining(rgb_frames=2, **SIZES)
 END_TO_END = EndToEndTraining(**SIZES)
 
 

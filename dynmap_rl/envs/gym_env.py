@@ -23,15 +23,16 @@ class DynmapEnv(gym.Env):
 
     Description:
         The block stands on the cart and is held by friction alone. It tips when the cart accelerates faster than
-        about ``9.81 * block_width / block_height`` (2.9 to 4.9 m/s^2 in the default ranges). Sizes, positions and
+        about ``9.81 * block_width / block_height`` (2.9 to 4.9 m/s^2 in the default ranges), which the cart's limit
+        exceeds: only careful control keeps it up. Sizes, positions and
         colours change with every episode. An episode lasts 120 steps (6 s). There are three tasks:
         ``balance_reaching`` (task 1: carry the block to the goal), ``balance_reaching_obstacle`` (task 2: the same
         around an obstacle) and ``bin_dropping`` (task 3: tip the block into a bin).
 
     Action:
         ``control="position"``: float32 ``(3,)``, the change dX, dY, dTheta of the commanded cart pose in one step,
-        at most 20 mm, 20 mm, 50 mrad (0.4 m/s, 0.4 m/s, 1 rad/s). ``control="acceleration"``: float32 ``(3,)``, the
-        acceleration of the cart, at most 3 m/s^2, 3 m/s^2, 10 rad/s^2. In both cases the cart stays within its limits
+        at most 40 mm, 40 mm, 100 mrad (0.8 m/s, 0.8 m/s, 2 rad/s). ``control="acceleration"``: float32 ``(3,)``, the
+        acceleration of the cart, at most 6 m/s^2, 6 m/s^2, 20 rad/s^2. In both cases the cart stays within its limits
         of speed and acceleration and brakes before the edge of the workspace. Actions are in SI units and mean the
         same in datasets, in TorchRL and here. ``gymnasium.wrappers.RescaleAction`` scales them to -1 to 1, for
         learners that explore with noise of size 1.
@@ -48,9 +49,9 @@ class DynmapEnv(gym.Env):
 
     Reward:
         About -1 to 1 a step; the classes of the tasks have the formulas. Task 1: grows with a smaller goal distance,
-        0 once the block is dropped. Task 2: grows with a shorter way around the obstacle, -1 once the block is dropped
-        or the obstacle touched. Task 3: 1 with the block in the bin, up to 0.2 for a block near it, -1 once the block
-        missed the bin or the cart touched it.
+        -20 once the block is dropped. Task 2: grows with a shorter way around the obstacle, -20 once the block is
+        dropped or the obstacle touched. Task 3: 1 with the block in the bin, up to 0.2 for a block near it, -5 once the
+        block missed the bin or the cart touched it.
 
     Success:
         Tasks 1 and 2, true in the last step only: the block was never dropped, the position error is under 50 mm, and
@@ -88,7 +89,9 @@ class DynmapEnv(gym.Env):
         ``reset(options={"cart_x": 0.3, "block_color": (0, 0, 90)})``.
 
     Version history:
-        v0: first release.
+        v1: the cart's limits are twice those of v0, above the acceleration at which blocks tip, so that the limits
+        alone no longer keep the block up. A failure costs 20 (task 3: 5).
+        v0: first release, no longer available.
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": int(1 / CONTROL_DT)}

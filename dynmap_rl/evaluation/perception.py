@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 
 from dynmap_rl.data.features import compute_features
-from dynmap_rl.envs.scene import GOAL_COLOR, Scene
+from dynmap_rl.data.recording.plans import Plan, roll_out
+from dynmap_rl.envs.scene import GOAL_COLOR, Scene, scene_seed
+from dynmap_rl.envs.tasks import get_task
+from dynmap_rl.experts.network import list_checkpoints
 from dynmap_rl.modules.world_model import WorldModel
 
 
@@ -73,17 +77,35 @@ def locate_cart(world_model: WorldModel, train: TensorDictBase, test: TensorDict
         train: episodes ``[E, T]`` to fit the map to, with ``pixels``, ``action``, ``goal`` and ``dynamics``.
         test: likewise, to measure the distance on.
     """
+    (x, y), (x_test, y_test) = (_latents_and_positions(world_model, part) for part in (train, test))
+    weights = torch.linalg.lstsq(x, y, driver="gelsd").solution
+    return (x_test @ weights - y_test).norm(dim=-1).mean().item()
 
-    def read(episodes: TensorDictBase) -> tuple[torch.Tensor, torch.Tensor]:
-        latent = compute_features(world_model, episodes)["latent"].flatten(0, 1).double().cpu()
-        return torch.nn.functional.pad(latent, (0, 1), value=1.0), episodes["dynamics", "position"][
-            ..., :2
-        ].flatten(0, 1)
 
-    inputs, positions = read(train)
-    weights = torch.linalg.lstsq(inputs, positions.double(), driver="gelsd").solution
-    inputs, positions = read(test)
-    return (inputs @ weights - positions).norm(dim=-1).mean().item()
+def _latents_and_positions(
+    world_model: WorldModel, episodes: TensorDictBase
+) -> tuple[torch.Tensor, torch.Tensor]:
+    latent = compute_features(world_model, episodes)["latent"].flatten(0, 1).double().cpu()
+    position = episodes["dynamics", "position"][..., :2].flatten(0, 1).double()
+    return torch.nn.functional.pad(latent, (0, 1), value=1.0), position
+
+
+def begin_scenes(task: str, count: int, steps: int = 11) -> tuple[TensorDictBase, list[Scene]]:
+    """Return the first steps of the expert in validation scenes, with the cart still away from the goal.
+
+    Args:
+        task: name of the task.
+        count: number of scenes.
+        steps: number of frames; the first is the context of the first prediction.
+
+    Returns:
+        Episodes ``[count, steps]`` and their scenes.
+    """
+    checkpoint = list_checkpoints(task)[-1]
+    plans = [Plan(seed, checkpoint) for seed in (scene_seed("validation", i) for i in range(count))]
+    rules = get_task(task)
+    scenes = [rules.sample_scene(np.random.default_rng(plan.scene_seed)) for plan in plans]
+    return roll_out(task, plans)[:, :steps], scenes
 
 
 def _split(scenes: Sequence[Scene], size: int) -> list[Sequence[Scene]]:

@@ -20,9 +20,10 @@ class PlainDecoder(nn.Module):
     Args:
         input_size: Z + 2 H.
         channels: channels of the maps of stride 8 and 4.
+        outputs: numbers for each pixel.
     """
 
-    def __init__(self, input_size: int, channels: tuple[int, int] = (64, 32)):
+    def __init__(self, input_size: int, channels: tuple[int, int] = (64, 32), outputs: int = 3):
         super().__init__()
         c1, c2 = channels
         self.expand = nn.Linear(input_size, c1 * 64)
@@ -30,30 +31,35 @@ class PlainDecoder(nn.Module):
             nn.Unflatten(1, (c1, 8, 8)),
             nn.ReLU(),
             up(c1, c2),
-            nn.Conv2d(c2, 3 * BLOCK**2, 3, 1, 1),
+            nn.Conv2d(c2, outputs * BLOCK**2, 3, 1, 1),
         )
 
     def forward(
         self, predicted_latent: torch.Tensor, hidden1: torch.Tensor, hidden2: torch.Tensor
     ) -> torch.Tensor:
-        """Decode ``[..., Z]`` and ``[..., H]`` twice to frames ``[..., 3, 64, 64]`` in 0..1."""
+        """Decode ``[..., Z]`` and ``[..., H]`` twice to frames ``[..., 3, 64, 64]``, about 0..1."""
         x = torch.cat([predicted_latent, hidden1, hidden2], -1)
-        blocks = self.layers(self.expand(x).flatten(0, -2))
-        return F.pixel_shuffle(blocks, BLOCK).unflatten(0, x.shape[:-1]) + 0.5
+        return self.draw(x.flatten(0, -2)).unflatten(0, x.shape[:-1]) + 0.5
+
+    def draw(self, x: torch.Tensor) -> torch.Tensor:
+        """Map states ``[N, Z + 2 H]`` to ``[N, outputs, 64, 64]``."""
+        return F.pixel_shuffle(self.layers(self.expand(x)), BLOCK)
 
 
-class SpriteDecoder(PlainDecoder):
-    """Plain CNN with sprites before it: small images with transparency, drawn at predicted places.
+class SpriteDecoder(nn.Module):
+    """A canvas of a few colours, and sprites before it: small images with transparency, drawn at predicted places.
 
-    The counterpart of :class:`~dynmap_rl.modules.GlimpseEncoder`, as the writing half of DRAW (Gregor et al. 2015).
-    Moving an object changes two numbers and not a filter for every place, and each pixel of a sprite has a colour of
-    its own from the start. What is not in a sprite is left to the CNN.
+    On the canvas, a CNN mixes M predicted colours at every pixel, so that a marker or a background changes its colour by
+    three numbers. The sprites are the counterpart of :class:`~dynmap_rl.modules.GlimpseEncoder`, as the writing half of
+    DRAW (Gregor et al. 2015): moving an object changes two numbers and not a filter for every place, and each pixel of
+    a sprite has a colour of its own from the start.
 
     Args:
         input_size: Z + 2 H.
         sprites: number of sprites; later ones cover earlier ones.
         side: side of a sprite, in pixels.
-        width: width of the MLP that paints the sprites.
+        colors: M.
+        width: width of the MLPs that paint sprites and mix colours.
         channels: channels of the CNN's maps of stride 8 and 4.
     """
 
@@ -62,11 +68,14 @@ class SpriteDecoder(PlainDecoder):
         input_size: int,
         sprites: int = 2,
         side: int = 24,
+        colors: int = 6,
         width: int = 256,
         channels: tuple[int, int] = (64, 32),
     ):
-        super().__init__(input_size, channels)
+        super().__init__()
         self.sprites, self.side = sprites, side
+        self.masks = PlainDecoder(input_size, channels, colors)
+        self.colors = nn.Sequential(nn.Linear(input_size, width), nn.SiLU(), nn.Linear(width, 3 * colors))
         self.place = nn.Linear(input_size, sprites * 2)
         nn.init.normal_(self.place.weight, std=0.05)
         nn.init.uniform_(self.place.bias, -0.3, 0.3)
@@ -79,22 +88,29 @@ class SpriteDecoder(PlainDecoder):
         self, predicted_latent: torch.Tensor, hidden1: torch.Tensor, hidden2: torch.Tensor
     ) -> torch.Tensor:
         """Decode ``[..., Z]`` and ``[..., H]`` twice to frames ``[..., 3, 64, 64]``, about 0..1."""
-        frames = super().forward(predicted_latent, hidden1, hidden2).float().flatten(0, -4)
-        frames = frames.transpose(1, 2)  # (N, 64, 3, 64): rows first
         x = torch.cat([predicted_latent, hidden1, hidden2], -1)
-        shape, x = x.shape[:-1], x.flatten(0, -2)
+        frames = self.draw_canvas(x.flatten(0, -2))
+        for sprite in self.draw_sprites(x.flatten(0, -2)).unbind(1):
+            frames = frames * (1 - sprite[:, 3:]) + sprite[:, :3]
+        return frames.unflatten(0, x.shape[:-1])
+
+    def draw_canvas(self, x: torch.Tensor) -> torch.Tensor:
+        """Draw what is behind the sprites, ``[N, 3, 64, 64]``, from states ``[N, Z + 2 H]``."""
+        masks = self.masks.draw(x).float().flatten(2).softmax(1)  # (N, M, 4096)
+        colors = self.colors(x).float().view(len(x), -1, 3) + 0.5
+        return (colors.mT @ masks).unflatten(2, (64, 64))
+
+    def draw_sprites(self, x: torch.Tensor) -> torch.Tensor:
+        """Draw each sprite, ``[N, S, 4, 64, 64]``: colours times opacity, and opacity."""
         count, side = len(x), self.side
-        sprites = self.paint(x).float().view(count, self.sprites, side, 4, side)
+        sprites = self.paint(x).float().view(count, self.sprites, side, 4, side)  # rows first
         opacity = (4 * sprites[..., 3:, :] - 2).sigmoid()
         color = sprites[..., :3, :] + self.tint(x).float().view(count, self.sprites, 1, 3, 1) + 0.5
-        sprites = torch.cat([opacity * color, opacity], -2)  # (N, S, side, 4, side)
+        sprites = torch.cat([opacity * color, opacity], -2)
         place = self.place(x).float().view(count, self.sprites, 2)
         across, down = hat_kernels(place, side).unbind(2)  # (N, S, side, 64)
-        rows = down.mT @ sprites.flatten(3)  # (N, S, 64, 4 * side)
-        drawn = rows.unflatten(3, (4, side)).flatten(2, 3) @ across  # (N, S, 64 * 4, 64)
-        for sprite in drawn.unflatten(2, (64, 4)).unbind(1):
-            frames = frames * (1 - sprite[:, :, 3:]) + sprite[:, :, :3]
-        return frames.transpose(1, 2).reshape(*shape, 3, 64, 64)
+        rows = (down.mT @ sprites.flatten(3)).unflatten(3, (4, side))  # (N, S, 64, 4, side)
+        return (rows.flatten(2, 3) @ across).unflatten(2, (64, 4)).transpose(2, 3)
 
 
 class DynamicsDecoder(nn.Module):

@@ -41,6 +41,21 @@ class Transition(nn.Module):
         predicted = latent + self.change(hidden2)
         return delay(predicted), delay(hidden1), delay(hidden2)
 
+    def imagine(
+        self, latent: torch.Tensor, action: torch.Tensor, context: int
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Predict a sequence, reading latents before step ``context`` (1 or more) and own predictions from there on.
+
+        Arguments and results are those of :meth:`forward`.
+        """
+        seen, actions = latent[:, :context], self.action.normalize(action)
+        hidden1, hidden2, state = self.lstm(torch.cat([seen, actions[:, :context]], -1))
+        steps = [(seen + self.change(hidden2), hidden1, hidden2)]
+        for t in range(context, latent.shape[1]):
+            predicted, state = self.step(steps[-1][0][:, -1], action[:, t], state)
+            steps.append((predicted[:, None], state[0][:, None], state[2][:, None]))
+        return tuple(delay(torch.cat(part, 1)) for part in zip(*steps, strict=True))
+
     def step(self, latent: torch.Tensor, action: torch.Tensor, state: State) -> tuple[torch.Tensor, State]:
         """Predict one step: ``z_t`` ``[B, Z]``, ``a_t`` ``[B, A]`` and ``h_t`` to ``z_hat_{t+1}`` and ``h_{t+1}``."""
         state = self.lstm.step(torch.cat([latent, self.action.normalize(action)], -1), state)

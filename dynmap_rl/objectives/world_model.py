@@ -37,8 +37,10 @@ class WorldModelLoss(LossModule):
             latents that do not vary, and the reconstruction stalls.
         rarity: weight of rare colours in ``loss_rgb``, see :func:`color_weights`; 0 is the paper's loss, in which the
             background outweighs small objects.
-        rgb_steps: number of random steps of a window whose frames are decoded; None decodes all.
-        generator: generator that draws these steps; by default torch's own.
+        imagined: share of the windows in which the world model sees no frames from a random step on, and predicts from
+            its own predictions. 0 is the paper's loss; more makes predictions over many steps accurate.
+        rgb_frames: number of random frames of the batch that are decoded; None decodes all.
+        generator: generator that draws these frames and steps; by default torch's own.
     """
 
     @dataclass
@@ -57,13 +59,15 @@ class WorldModelLoss(LossModule):
         beta_dynamics: float = 1.0,
         stop_gradient: bool = True,
         rarity: float = 0.0,
-        rgb_steps: int | None = None,
+        imagined: float = 0.0,
+        rgb_frames: int | None = None,
         generator: torch.Generator | None = None,
     ):
         super().__init__()
         self.world_model, self.generator = world_model, generator
         self.beta_z, self.beta_dynamics = beta_z, beta_dynamics
-        self.stop_gradient, self.rarity, self.rgb_steps = stop_gradient, rarity, rgb_steps
+        self.stop_gradient, self.rarity = stop_gradient, rarity
+        self.imagined, self.rgb_frames = imagined, rgb_frames
 
     @property
     def in_keys(self) -> list[NestedKey]:
@@ -80,7 +84,11 @@ class WorldModelLoss(LossModule):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Return the losses."""
-        return TensorDict(self.compare(tensordict, *self.predict(tensordict)), [])
+        latent, states = self.predict(tensordict)
+        read = latent
+        if blind := round(self.imagined * len(latent)):
+            read, states = self._imagine(tensordict, latent, states, blind)
+        return TensorDict(self.compare(tensordict, latent, states, read), [])
 
     def predict(self, tensordict: TensorDictBase) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
         """Return the latents ``[B, T, Z]``, and ``predicted_latent``, ``hidden1``, ``hidden2`` at every t."""
@@ -88,13 +96,27 @@ class WorldModelLoss(LossModule):
         with torch.autocast(latent.device.type, enabled=False):
             return latent, self.world_model.predict(latent, tensordict[self.tensor_keys.action])
 
-    def compare(self, tensordict: TensorDictBase, latent: torch.Tensor, states) -> dict[str, torch.Tensor]:
+    def _imagine(self, tensordict, latent, states, blind: int):
+        """Predict the first ``blind`` windows from their own predictions; return the latents read, and the states."""
+        steps, device = latent.shape[1], latent.device
+        context = torch.randint(1, steps, (1,), generator=self.generator, device=device).item()
+        action = tensordict[self.tensor_keys.action][:blind]
+        with torch.autocast(device.type, enabled=False):
+            imagined = self.world_model.transition.imagine(latent[:blind], action, context)
+        read = torch.cat([latent[:blind, :context], imagined[0][:, context:]], 1)
+        states = tuple(torch.cat([a, b[blind:]]) for a, b in zip(imagined, states, strict=True))
+        return torch.cat([read, latent[blind:]]), states
+
+    def compare(
+        self, tensordict: TensorDictBase, latent: torch.Tensor, states, read: torch.Tensor | None = None
+    ) -> dict[str, torch.Tensor]:
         """Return the losses by name.
 
         Args:
             tensordict: the input.
             latent: first result of :meth:`predict`.
             states: second result of :meth:`predict`.
+            read: latents ``[B, T, Z]`` from which the states were predicted; by default ``latent``.
         """
         model, keys = self.world_model, self.tensor_keys
         predicted, hidden1, hidden2 = (x[:, 1:] for x in states)  # (B, T-1, .)
@@ -102,7 +124,7 @@ class WorldModelLoss(LossModule):
         masks = tensordict.select(*self._loss_mask_keys(), strict=False)[:, 1:]
         losses = {
             "loss_rgb": self._rgb_loss(masks, pixels, predicted, hidden1, hidden2),
-            "loss_latent": self.beta_z * self._mean(self._latent_error(latent, predicted), masks),
+            "loss_latent": self.beta_z * self._mean(self._latent_error(latent, predicted, read), masks),
         }
         for name, value in model.decode_dynamics(predicted, hidden1, hidden2).items():
             scale = model.dynamics_decoder.normalizers[name].scale
@@ -114,18 +136,18 @@ class WorldModelLoss(LossModule):
         """Return the mean of an error over the valid steps ``[B, T]``."""
         return self._reduce_loss(error, masks, reduction="mean")
 
-    def _latent_error(self, latent, predicted) -> torch.Tensor:
-        before, target = latent[:, :-1], latent[:, 1:]
+    def _latent_error(self, latent, predicted, read) -> torch.Tensor:
+        before, target = (latent if read is None else read)[:, :-1], latent[:, 1:]
         if self.stop_gradient:
             predicted = predicted - before + before.detach()  # only the predicted change is moved
             target = target.detach()
         return rms(predicted - target)
 
     def _rgb_loss(self, masks, pixels, *states) -> torch.Tensor:
-        steps = pixels.shape[1]
-        if self.rgb_steps is not None and self.rgb_steps < steps:
-            index = torch.randperm(steps, generator=self.generator, device=pixels.device)[: self.rgb_steps]
-            masks, pixels, states = masks[:, index], pixels[:, index], [s[:, index] for s in states]
+        frames = pixels.shape[0] * pixels.shape[1]
+        if self.rgb_frames is not None and self.rgb_frames < frames:
+            index = torch.randperm(frames, generator=self.generator, device=pixels.device)[: self.rgb_frames]
+            masks, pixels, *states = (x.flatten(0, 1)[index][None] for x in (masks, pixels, *states))
         frames = self.world_model.decode_pixels(*states).float()
         error = (frames - pixels / 255).square().mean(-3)  # (B, T, 64, 64)
         if self.rarity:

@@ -70,7 +70,7 @@ def fit(
     progress = tqdm(range(start, settings.updates), folder.name, settings.updates, initial=start)
     for update in progress:
         set_learning_rate(optimizer, settings.learning_rate, update, settings.updates)
-        windows = sample_windows(episodes, settings.windows, settings.window_steps, generator)
+        windows = sample_windows(episodes, *settings.windows_at(update), generator)
         windows = change_windows(windows, settings.augmentation, generator)
         with mixed_precision(device):
             losses = loss_module(windows)

@@ -8,6 +8,8 @@ from dynmap_rl.data.settings import Augmentation
 from dynmap_rl.keys import DYNAMICS
 from dynmap_rl.utils.settings import check_at_least, check_choice
 
+SHORT = 4  # steps of a short window
+
 
 @dataclass(frozen=True)
 class WorldModelArchitecture:
@@ -41,8 +43,14 @@ class WorldModelTraining(WorldModelArchitecture):
     windows: int = 12
     # Time steps of a window.
     window_steps: int = 24
-    # Frames decoded in a window, drawn at random.
-    rgb_steps: int = 6
+    # Share of the updates, at first, whose batches have the same number of frames in windows of 4 steps: what objects
+    # look like is learned from many scenes, and memory afterwards.
+    short_windows: float = 0.4
+    # Share of the windows in which no frames are seen after a random step: the world model learns to predict from its own
+    # predictions.
+    imagined: float = 0.5
+    # Frames of a batch that are decoded, drawn at random.
+    rgb_frames: int = 72
     # Peak learning rate (100 steps of warm-up, then a cosine).
     learning_rate: float = 2e-3
     # Weight of rare colours in the RGB loss: a pixel's weight falls with this power of the number of pixels of its
@@ -59,9 +67,17 @@ class WorldModelTraining(WorldModelArchitecture):
 
     def __post_init__(self):
         super().__post_init__()
-        check_at_least(self, 1, "updates", "windows", "rgb_steps")
+        check_at_least(self, 1, "updates", "windows", "rgb_frames")
         check_at_least(self, 2, "window_steps")
-        check_at_least(self, 0, "learning_rate", "rarity", "beta_z", "beta_dynamics")
+        check_at_least(
+            self, 0, "short_windows", "imagined", "learning_rate", "rarity", "beta_z", "beta_dynamics"
+        )
+
+    def windows_at(self, update: int) -> tuple[int, int]:
+        """Return number and steps of the windows of an update."""
+        if update < self.short_windows * self.updates and self.window_steps > SHORT:
+            return max(1, self.windows * self.window_steps // SHORT), SHORT
+        return self.windows, self.window_steps
 
 
 @dataclass(frozen=True)
@@ -120,13 +136,17 @@ class EndToEndTraining:
         check_at_least(self, 2, "window_steps")
         check_at_least(self, 0, "learning_rate", "emphasis")
 
+    def windows_at(self, update: int) -> tuple[int, int]:
+        """Return number and steps of the windows of an update, which are all the same."""
+        return self.windows, self.window_steps
+
 
 @dataclass(frozen=True)
 class JointTraining(EndToEndTraining):
     """Training of world model and policy with one loss (paper, Eq. 4 and 5)."""
 
-    # Frames decoded in a window, drawn at random.
-    rgb_steps: int = 16
+    # Frames of a batch that are decoded, drawn at random.
+    rgb_frames: int = 128
     # Weight of rare colours in the RGB loss: a pixel's weight falls with this power of the number of pixels of its
     # colour; 0 is the paper's plain L2.
     rarity: float = 0.75
@@ -139,7 +159,7 @@ class JointTraining(EndToEndTraining):
 
     def __post_init__(self):
         super().__post_init__()
-        check_at_least(self, 1, "rgb_steps")
+        check_at_least(self, 1, "rgb_frames")
         check_at_least(self, 0, "rarity", "beta_z", "beta_dynamics", "beta_joint")
 
 

@@ -71,4 +71,6 @@ def make_loss(
 ) -> WorldModelLoss:
     """Make the world model's loss module, whose decoded frames ``generator`` draws."""
     weights = {"beta_z": settings.beta_z, "beta_dynamics": settings.beta_dynamics, "rarity": settings.rarity}
-    return WorldModelLoss(world_model, **weights, rgb_steps=settings.rgb_steps, generator=generator)
+    if isinstance(settings, WorldModelTraining):
+        weights["imagined"] = settings.imagined
+    return WorldModelLoss(world_model, **weights, rgb_frames=settings.rgb_frames, generator=generator)

@@ -31,7 +31,7 @@ def world_model_training(
     constants = load_meta(dataset)["normalization"]
     windows = sample_windows(episodes, count, steps, torch.Generator().manual_seed(0))
     fast = make_world_model(constants, SUPERVISION).to(memory_format=torch.channels_last)
-    loss_module = WorldModelLoss(fast, rgb_steps=8, generator=torch.Generator())
+    loss_module = WorldModelLoss(fast, rgb_frames=128, generator=torch.Generator())
     optimizer = make_optimizer(fast, 1e-4, 1e-4)
 
     def ours():
@@ -71,7 +71,7 @@ class PlainWorldModel(nn.Module):
         for cell, layer in zip(self.cells, layers, strict=True):
             cell.load_state_dict({k.removesuffix("_l0"): v for k, v in layer.state_dict().items()})
 
-    def loss(self, windows, rgb_steps: int | None) -> torch.Tensor:
+    def loss(self, windows, rgb_frames: int | None) -> torch.Tensor:
         model, pixels = self.model, windows["pixels"]
         encoder = model.encoder
         frames = pixels.flatten(0, 1).float() / 255
@@ -93,7 +93,7 @@ class PlainWorldModel(nn.Module):
             outputs.append((latent[:, t] + model.transition.change(below), states[0][0], below))
         predicted, hidden1, hidden2 = (torch.stack(x, 1) for x in zip(*outputs, strict=True))
         target = frames.unflatten(0, pixels.shape[:2])[:, 1:]
-        chosen = torch.randperm(target.shape[1])[:rgb_steps]
+        chosen = torch.randperm(target.shape[1])[:rgb_frames]
         decoded = model.decode_pixels(predicted[:, chosen], hidden1[:, chosen], hidden2[:, chosen])
         loss = rms((decoded - target[:, chosen]).flatten(-3)).mean()
         change = predicted - latent[:, :-1] + latent[:, :-1].detach()

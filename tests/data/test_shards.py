@@ -31,6 +31,8 @@ def test_metadata_tells_how_every_episode_was_made(recordings, name):
         assert json.loads(json.dumps(scene.to_dict())) == row["scene"]
     seeds = {split: {r["scene_seed"] for r in rows if r["split"] == split} for split in ("train", "eval")}
     assert len(seeds["train"]) == 4 and len(seeds["eval"]) == 2
+    seen = [max(seeds[split]) + 1 - min(seeds[split]) // 500 * 500 for split in seeds]
+    assert meta["rejected"] == sum(seen) - 6
     assert max(seeds["train"]) < 100_000_000 <= min(seeds["eval"])
     disturbed = load_dataset(recording)["disturbed"]
     for row, marks in zip(rows, disturbed, strict=True):

@@ -22,7 +22,7 @@ PLUGIN = "discover_packages_path=dynmap_rl.integrations.lerobot"
 TASKS = tuple(GYMNASIUM_IDS)
 QUICK = ["--batch_size=2", "--log_freq=1", "--num_workers=0", "--env_eval_freq=0"]
 SMALL = {
-    "dynmap": ["--policy.window_steps=6", "--policy.rgb_steps=2"],
+    "dynmap": ["--policy.window_steps=6", "--policy.rgb_frames=2"],
     "act": [
         "--policy.pretrained_backbone_weights=null",
         "--policy.dim_model=16",
@@ -94,7 +94,7 @@ def trained(recording, installed, tmp_path_factory):
     command += [*train_arguments("dynmap", recording, output, 4), "--env.type=dynmap"]
     command += ["--env_eval_freq=4", "--eval.n_episodes=1", "--eval.batch_size=1", "--env.split=validation"]
     # Nothing random in a step: LeRobot restores torch's generator, but then draws from it for its loader.
-    command += ["--policy.recolor=false", "--policy.rgb_steps=6"]
+    command += ["--policy.recolor=false", "--policy.rgb_frames=6"]
     environment = os.environ | {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", "PYTHONPATH": str(installed)}
     done = subprocess.run(
         command, cwd=output.parent, env=environment, capture_output=True, text=True, timeout=400

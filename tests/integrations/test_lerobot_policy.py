@@ -16,7 +16,7 @@ from dynmap_rl.integrations.lerobot.modeling_dynmap import DynmapPolicy
 from dynmap_rl.modules.actor import Actor
 from dynmap_rl.utils.weights import fingerprint
 
-SMALL = {"device": "cpu", "push_to_hub": False, "window_steps": 6, "rgb_steps": 2}
+SMALL = {"device": "cpu", "push_to_hub": False, "window_steps": 6, "rgb_frames": 2}
 
 
 def load_windows(recording, policy, starts, episodes=None):

@@ -123,3 +123,18 @@ def test_tensordict_modules_take_nested_keys():
     assert torch.equal(out["out", "dynamics", "position"], plain["predicted_dynamics", "position"])
     assert torch.equal(out["out", "frame"], plain["reconstruction", "pixels"])
     assert torch.equal(out["m", "z_hat"], plain["predicted_latent"])
+
+
+@torch.no_grad()
+def test_imagined_sequence_equals_steps_on_own_predictions():
+    model, td = make(), batch()
+    latent = model.encode(td["pixels"])
+    predicted, hidden1, hidden2 = model.transition.imagine(latent, td["action"], context=3)
+    state, guess = model.initial_state(2), None
+    for t in range(6):
+        guess, state = model.step(latent[:, t] if t < 3 else guess, td["action"][:, t], state)
+        for found, expected in ((predicted, guess), (hidden1, state[0]), (hidden2, state[2])):
+            torch.testing.assert_close(found[:, t + 1], expected, rtol=1e-5, atol=1e-5)
+    whole = model.transition.imagine(latent, td["action"], context=7)
+    for found, expected in zip(whole, model.predict(latent, td["action"]), strict=True):
+        torch.testing.assert_close(found, expected)

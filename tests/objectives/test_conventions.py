@@ -122,6 +122,6 @@ def test_masking_the_end_of_windows_equals_cutting_it_off(td):
 
 
 def test_a_mask_without_valid_steps_gives_zero_with_few_decoded_frames(td):
-    loss = make("world model", rgb_steps=2)
+    loss = make("world model", rgb_frames=2)
     td["collector", "mask"] = torch.zeros(B, T, dtype=torch.bool)
     assert all(value == 0 for value in loss(td).values())

@@ -97,3 +97,29 @@ def test_rms_has_a_gradient_at_zero():
     x = torch.zeros(3, requires_grad=True)
     rms(x).backward()
     assert x.grad.isfinite().all()
+
+
+def test_imagined_windows_read_no_frames_after_their_context():
+    """With the same encoder, frames at the end of imagined windows change nothing but what is compared with them."""
+    torch.manual_seed(0)
+    td = batch(b=4, t=6)
+    _, loss = make(("position",), imagined=1.0)
+    losses = []
+    for frame in (0, 255):
+        td["pixels"][:, -2] = frame  # the last step is predicted from its frame, or from a prediction
+        loss.generator = torch.Generator().manual_seed(3)
+        losses.append(loss(td)["loss_position"].item())
+    context = torch.randint(1, 6, (1,), generator=torch.Generator().manual_seed(3)).item()
+    assert context <= 4 and losses[0] == losses[1]
+    _, seen = make(("position",), imagined=0.0)
+    first = seen(td)["loss_position"].item()
+    td["pixels"][:, -2] = 0
+    assert seen(td)["loss_position"].item() != first
+
+
+def test_the_latent_loss_of_imagined_windows_moves_the_predicted_change_alone():
+    model, loss = make((), beta_z=1.0, imagined=1.0)
+    torch.nn.init.zeros_(model.transition.change.weight)
+    loss(batch())["loss_latent"].backward()
+    assert model.transition.change.bias.grad.abs().sum() > 0
+    assert all(p.grad is None or p.grad.abs().sum() == 0 for p in model.encoder.parameters())

@@ -82,7 +82,7 @@ def test_policies_on_a_world_model_of_another_run(small):
 
 def options(pretrained):
     """Return options that undo the preset's sizes of the world model, which have no effect with ``--pretrained``."""
-    sizes = {"updates": 2500, "windows": 16, "window_steps": 24, "rgb_steps": 8}
+    sizes = {"updates": 2500, "windows": 16, "window_steps": 24, "rgb_frames": 128}
     return ["--pretrained", pretrained, *(f"--world_model.{name}={size}" for name, size in sizes.items())]
 
 

@@ -28,6 +28,14 @@ def test_writes_errors_and_probes_of_every_world_model(trained, recording, tmp_p
     assert len(facts["open_loop"]["RGB+[P], decoupled"]["model"]["cart_mm"]) == 4
     assert list(facts["probes"]) == ["Only-RGB, decoupled", "RGB+[P], decoupled"]
     assert len(facts["probes"]["Only-RGB, decoupled"]["latent"]["velocity"]) == 6
+    for found in facts["perception"].values():
+        assert list(found) == ["held-out demonstrations", "first ten steps"]
+        for values in found.values():
+            assert (
+                values["chroma_explained"] < 0.5
+                and values["object_error"] > 0.05
+                and values["cart_error"] > 0
+            )
     for name in ("open_loop", "probes"):
         assert (tmp_path / f"runs/probe/{name}.png").stat().st_size > 10_000
     page = (tmp_path / "runs/probe/report.html").read_text()

@@ -23,9 +23,9 @@ def datasets(tmp_path_factory):
 JOINT = ["--method", "joint", "--goal", "observation.state:0,1", "--policy.kind", "feedforward"]
 UNDO = [  # sizes of the preset that have no effect in joint training
     "--world_model.updates=2500", "--world_model.windows=16", "--world_model.window_steps=24",
-    "--world_model.rgb_steps=8", "--policy.updates=2500", "--policy.batch=32", "--policy.copies=2",
+    "--world_model.rgb_frames=128", "--policy.updates=2500", "--policy.batch=32", "--policy.copies=2",
 ]  # fmt: skip
-SIZES = ["--joint.updates=4", "--joint.windows=2", "--joint.window_steps=6", "--joint.rgb_steps=2"]
+SIZES = ["--joint.updates=4", "--joint.windows=2", "--joint.window_steps=6", "--joint.rgb_frames=2"]
 
 
 @pytest.mark.slow

@@ -30,7 +30,7 @@ def test_a_training_step_does_not_wait_for_the_gpu(recording, trained):
     policy = make_policy(constants, "recurrent", model).cuda()
     generator = torch.Generator("cuda").manual_seed(0)
     features = compute_features(model, episodes, 1, generator).to("cuda")
-    world_model_loss = WorldModelLoss(model, rgb_steps=2)
+    world_model_loss = WorldModelLoss(model, rgb_frames=2)
     loss_module = {
         "world_model": world_model_loss,
         "jointly": JointLoss(world_model_loss, policy, emphasis=60.0),

@@ -37,7 +37,7 @@ def test_errors_of_every_entry_on_request(tmp_path):
     assert {f"error_position_{i}" for i in range(6)} < read_metrics(tmp_path)[-1].keys()
 
 
-@pytest.mark.parametrize("changes", [{"seed": 1}, {"beta_z": 0.0}, {"beta_dynamics": 0.0}, {"rgb_steps": 1}])
+@pytest.mark.parametrize("changes", [{"seed": 1}, {"beta_z": 0.0}, {"beta_dynamics": 0.0}, {"rgb_frames": 1}])
 def test_every_setting_has_an_effect(tmp_path, changes):
     models = make_model(), make_model()
     for model, settings in zip(models, (WORLD_MODEL, replace(WORLD_MODEL, **changes)), strict=True):

@@ -120,7 +120,7 @@ def _describe(meta: dict, instruction: str) -> str:
     collect += f" --expert {meta['expert']}" if meta["expert"] != task else ""
     maker, command = {
         "demonstrations": (
-            "state-based PPO experts act; all episodes succeed, most with short pushes",
+            "state-based PPO experts act; all episodes succeed, two of three with noise, some with short pushes",
             collect,
         ),
         "exploration": ("state-based PPO experts act, with noise and detours", collect),

@@ -26,7 +26,7 @@ KEYS = [
     *(("next", k) for k in ("reward", "done", "is_success", "dropped", "position_error")),
 ]
 
-PUSH = 0.2  # largest acceleration of a push, as a share of the cart's limit
+PUSH = 0.15  # largest acceleration of a push, as a share of the cart's limit
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def plan_demonstrations(
         seed = scene_seed(split, i)
         pushes = _draw_pushes(seed, get_task(task).pushes) if i % 3 == 1 else ()
         checkpoint = checkpoints[(i // 3) % len(checkpoints)]
-        plans.append(Plan(seed, checkpoint, noise=(0.0, 0.1, 0.2)[i % 3], pushes=pushes))
+        plans.append(Plan(seed, checkpoint, noise=(0.0, 0.05, 0.1)[i % 3], pushes=pushes))
     return plans
 
 

@@ -126,6 +126,7 @@ def merge_shards(shards: list[Shard], folder: Path, settings: dict) -> None:
         )
     meta = {"format": FORMAT} | {name: settings[name] for name in ("task", "expert", "kind")}
     meta |= {"splits": splits, "normalization": normalization_constants(episodes[:train])}
+    meta["rejected"] = sum(_count_rejected(shard) for shard in shards)
     meta["episodes"] = [{"episode_index": i, **row} for i, row in enumerate(rows)]
     write_json(folder / META, meta)
 
@@ -148,6 +149,14 @@ def _roll_out_shard(shard: Shard) -> tuple[list[Plan], TensorDict]:
         kept.append(episodes[chosen])
         missing, start = missing - len(chosen), start + size
     return plans, torch.cat(kept)
+
+
+def _count_rejected(shard: Shard) -> int:
+    """Return how many candidates failed before the shard had its episodes; scenes are taken in order."""
+    if shard.kind != "demonstrations":
+        return 0
+    first = _plan(shard, shard.number * CANDIDATES_PER_SHARD, 1)[0].scene_seed
+    return read_json(shard.folder / ROWS, list)[-1]["scene_seed"] + 1 - first - shard.count
 
 
 def _plan(shard: Shard, start: int, count: int) -> list[Plan]:

@@ -29,7 +29,7 @@ class DynmapConfig(PreTrainedConfig):
         architecture: ``glimpse`` or ``plain`` (see :class:`dynmap_rl.modules.WorldModel`).
         width: width of the policy; 0 for its default.
         window_steps: steps of a training window.
-        rgb_steps: decoded frames of a window.
+        rgb_frames: decoded frames of a batch.
         rarity: weight of rare colours in the RGB loss.
         beta_z: weight of the latent loss.
         beta_dynamics: weight of the loss of every supervised quantity.
@@ -55,7 +55,7 @@ class DynmapConfig(PreTrainedConfig):
     architecture: str = "glimpse"
     width: int = 0
     window_steps: int = 48
-    rgb_steps: int = 16
+    rgb_frames: int = 128
     rarity: float = 0.75
     beta_z: float = 0.1
     beta_dynamics: float = 1.0

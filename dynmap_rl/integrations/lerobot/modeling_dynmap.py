@@ -85,7 +85,7 @@ class DynmapPolicy(PreTrainedPolicy):
             config.beta_z,
             config.beta_dynamics,
             rarity=config.rarity,
-            rgb_steps=config.rgb_steps,
+            rgb_frames=config.rgb_frames,
         )
         # As an attribute, the loss module would save all weights a second time.
         loss_module = JointLoss(world_model_loss, self.policy, config.beta_joint, config.emphasis)

@@ -1,0 +1,52 @@
+"""Corrections of a student by the expert: DAgger (Ross et al. 2011)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs.utils import step_mdp
+from tqdm import tqdm
+
+from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
+from dynmap_rl.envs.world import EPISODE_STEPS, limit_actions
+from dynmap_rl.experts.network import load_expert, task_of_expert
+
+
+@torch.no_grad()
+def collect_corrections(
+    actor: TensorDictModuleBase, task: str, seeds: list[int], expert: str | Path | None = None
+) -> TensorDict:
+    """Let a student act in scenes, and record what the expert would have done in every state that it reaches.
+
+    Args:
+        actor: the student, such as :class:`dynmap_rl.modules.Actor`.
+        task: name of the task.
+        seeds: seeds of the scenes.
+        expert: folder or task of the expert's checkpoints; by default the expert that ships for the task.
+
+    Returns:
+        Episodes ``[E, 120]`` with ``pixels``, ``goal``, ``dynamics``, the student's ``action`` as executed,
+        ``expert_action``, and ``failed`` bool ``[..., 1]``: steps after a failure, in which there is nothing to correct.
+    """
+    actor, device, count = actor.eval(), next(actor.parameters()).device, len(seeds)
+    env = DynmapBatchedEnv(task, count, from_pixels=True, device=device)
+    network, rules = load_expert(expert or task), task_of_expert(expert or task, env.task)
+    td = env.reset(TensorDict({"scene_seed": torch.tensor(seeds)}, [count]))
+    steps = []
+    for _ in tqdm(range(EPISODE_STEPS), f"corrections in {count} scenes", unit="step", leave=False):
+        worlds = env.worlds
+        failed = torch.tensor([[env.task.is_over(world)] for world in worlds])
+        state = torch.from_numpy(np.stack([rules.state(world) for world in worlds]))
+        wanted = [w.action_for(a) for w, a in zip(worlds, network(state)[0].numpy(), strict=True)]
+        expert_action = limit_actions(worlds, np.stack(wanted)).astype(np.float32)
+        td = env.step(actor(td))
+        step = td.select("pixels", "goal", "dynamics").cpu().set("failed", failed)
+        step["action"] = torch.from_numpy(np.stack([w.action for w in env.worlds]).astype(np.float32))
+        step["expert_action"] = torch.from_numpy(expert_action)
+        steps.append(step)
+        td = step_mdp(td, keep_other=False)
+    return torch.stack(steps, 1)
