@@ -89,7 +89,7 @@ def main(config: Config) -> None:
     judge = partial(judge_in_closed_loop, task=config.task, settings=config.eval)
     fingerprint = train_policies(
         world_model, episodes, constants, folder, config.policy,
-        judge=judge, seeds=seeds, compute=config.compute, logger=config.logger,
+        judge=judge, task=config.task, seeds=seeds, compute=config.compute, logger=config.logger,
     )  # fmt: skip
     result = write_report(
         folder, world_model, episodes["eval"], seeds,

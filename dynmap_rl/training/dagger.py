@@ -8,12 +8,19 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
+from torch import nn
 from torchrl.envs.utils import step_mdp
 from tqdm import tqdm
 
+from dynmap_rl.data.features import compute_features
+from dynmap_rl.envs.scene import scene_seed
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.envs.world import EPISODE_STEPS, limit_actions
-from dynmap_rl.experts.network import load_expert, task_of_expert
+from dynmap_rl.experts.network import list_checkpoints, load_expert, task_of_expert
+from dynmap_rl.modules.actor import Actor
+from dynmap_rl.modules.world_model import WorldModel
+
+FIRST_SCENE = 1_000_000  # far from the scenes of demonstrations
 
 
 @torch.no_grad()
@@ -50,3 +57,30 @@ def collect_corrections(
         steps.append(step)
         td = step_mdp(td, keep_other=False)
     return torch.stack(steps, 1)
+
+
+def check_expert(task: str | None) -> None:
+    """Raise ``ValueError`` if there is no expert that could correct a policy."""
+    if task is None:
+        raise ValueError("PolicyTraining.corrections need the expert of a task, got no task")
+    list_checkpoints(task)
+
+
+def add_corrections(
+    features: TensorDict, world_model: WorldModel, policy: nn.Module, task: str, scenes: int, seed: int
+) -> TensorDict:
+    """Return training states ``[E, T]`` (see :func:`compute_features`) and those of corrections, ``[E + scenes, T]``.
+
+    Args:
+        features: training states so far.
+        world_model: frozen world model of the states.
+        policy: the student.
+        task: name of the task, whose expert corrects.
+        scenes: number of scenes.
+        seed: chooses the scenes.
+    """
+    seeds = [scene_seed("train", FIRST_SCENE + seed * scenes + i) for i in range(scenes)]
+    corrections = collect_corrections(Actor(world_model, policy, mixed=True), task, seeds)
+    states = compute_features(world_model, corrections).to(features.device)
+    states["disturbed"] |= corrections["failed"].to(states.device)
+    return torch.cat([features, states])

@@ -9,7 +9,7 @@ from __future__ import annotations
 import errno
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -30,6 +30,7 @@ from dynmap_rl.utils.files import read_json, write_json
 from dynmap_rl.utils.processes import run_processes
 from dynmap_rl.utils.weights import fingerprint
 
+from .dagger import add_corrections, check_expert
 from .policy import train_policy
 from .settings import PolicyTraining
 
@@ -53,6 +54,7 @@ def train_policies(
     settings: PolicyTraining | None = None,
     *,
     judge: Judge,
+    task: str | None = None,
     seeds: Sequence[int] = (0, 1, 2),
     compute: Compute | None = None,
     logger: str | None = None,
@@ -68,6 +70,7 @@ def train_policies(
         judge: function of world model and policy to the content of ``eval.json``. With more than one thread it must
             be picklable, such as a ``functools.partial`` of
             :func:`dynmap_rl.evaluation.protocol.judge_in_closed_loop`.
+        task: name of the task, whose expert gives the corrections of the settings.
         seeds: seeds of the policies.
         compute: device, and policies trained at a time.
         logger: ``tensorboard``, ``wandb``, ``trackio`` or None.
@@ -76,15 +79,17 @@ def train_policies(
         The fingerprint of the frozen world model.
 
     Raises:
-        ValueError: the frozen weights have changed.
+        ValueError: the frozen weights have changed, or corrections are wanted and there is no expert.
         OSError: a process died, or the disk is full.
     """
     settings, compute, folder = settings or PolicyTraining(), compute or Compute(), Path(folder)
+    if settings.corrections:
+        check_expert(task)
     world_model.eval().requires_grad_(False)
     frozen = fingerprint(world_model)
     save_world_model(folder / "world_model", world_model)
     if todo := [seed for seed in seeds if not (folder / f"seed_{seed}" / "eval.json").exists()]:
-        work = _Work(folder, constants, settings, judge, compute.device, logger, frozen)
+        work = _Work(folder, constants, settings, judge, task, compute.device, logger, frozen)
         states = folder / "features"
         shutil.rmtree(states, ignore_errors=True)  # left behind by a kill
         try:
@@ -105,6 +110,7 @@ class _Work:
     constants: dict
     settings: PolicyTraining
     judge: Judge
+    task: str | None
     device: str
     logger: str | None
     frozen: str
@@ -141,6 +147,13 @@ def _train(arguments: tuple[_Work, int]) -> None:
     policy = make_policy(work.constants, work.settings.kind, world_model).to(choose_device(work.device))
     states = [TensorDict.load_memmap(work.folder / "features" / name) for name in ("train", "eval")]
     train_policy(policy, *states, path, work.settings, seed=seed, logger=work.logger)
+    if work.settings.corrections:
+        world_model.requires_grad_(False).to(next(policy.parameters()).device)
+        states[0] = add_corrections(
+            states[0], world_model, policy, work.task, work.settings.corrections, seed
+        )
+        more = replace(work.settings, updates=work.settings.correction_updates)
+        train_policy(policy, *states, path, more, seed=seed, done=work.settings.updates, logger=work.logger)
     save_policy(path / "policy", policy, world_model)
     write_json(path / TRAINED, {"world_model_sha256": work.frozen})
 

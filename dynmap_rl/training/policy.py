@@ -26,6 +26,7 @@ def train_policy(
     settings: PolicyTraining | None = None,
     *,
     seed: int = 0,
+    done: int = 0,
     logger: str | None = None,
 ) -> None:
     """Minimise the L1 imitation loss on precomputed states; the world model is not needed.
@@ -37,6 +38,7 @@ def train_policy(
         folder: gets ``metrics.jsonl``.
         settings: sizes and learning rate; default :class:`PolicyTraining`.
         seed: seed of the batches, and line of the progress bar.
+        done: updates of an earlier training of this policy, after which the metrics go on.
         logger: ``tensorboard``, ``wandb``, ``trackio`` or None.
 
     Raises:
@@ -44,7 +46,7 @@ def train_policy(
     """
     settings, folder = settings or PolicyTraining(), Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    truncate_metrics(folder, 0)
+    truncate_metrics(folder, done)
     optimizer = make_optimizer(policy, settings.learning_rate, weight_decay=1e-3)
     device = next(policy.parameters()).device
     features, held_out = features.to(device), held_out.to(device)
@@ -58,11 +60,11 @@ def train_policy(
         with mixed_precision(device):
             loss = loss_module(batch)["loss_policy"]
         norm = step(loss, optimizer)
-        done = update + 1
-        if done % 100 == 0 or done in (1, settings.updates):
+        count = update + 1
+        if count % 100 == 0 or count in (1, settings.updates):
             first = check_loss(loss.item(), norm, first)
-        if done % 100 == 0 or done == settings.updates:
+        if count % 100 == 0 or count == settings.updates:
             with torch.no_grad():
                 validation = plain(held_out)["loss_policy"]
-            log_metrics(folder, done, logger, loss=loss.item(), held_out_loss=validation)
+            log_metrics(folder, done + count, logger, loss=loss.item(), held_out_loss=validation)
             progress.set_postfix(loss=f"{loss:.4f}", held_out=f"{validation:.4f}")

@@ -107,11 +107,16 @@ class PolicyTraining(PolicyArchitecture):
     learning_rate: float = 3e-3
     # Extra weight of steps in which the expert changes its action (see imitation_loss); 0 is the paper's plain L1.
     emphasis: float = 60.0
+    # Scenes of training in which the trained policy acts and the task's expert says what it would have done (DAgger).
+    # Their states join the demonstrations', and training goes on.
+    corrections: int = 0
+    # Optimiser steps with the corrections.
+    correction_updates: int = 800
 
     def __post_init__(self):
         super().__post_init__()
-        check_at_least(self, 1, "updates", "batch")
-        check_at_least(self, 0, "copies", "learning_rate", "emphasis")
+        check_at_least(self, 1, "updates", "batch", "correction_updates")
+        check_at_least(self, 0, "copies", "learning_rate", "emphasis", "corrections")
 
 
 @dataclass(frozen=True)

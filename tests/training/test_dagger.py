@@ -1,13 +1,19 @@
 """Corrections: the student acts, the expert says what it would have done."""
 
 import numpy as np
+import pytest
 import torch
+from small import CONSTANTS, judge, make_episodes, make_model
 from tensordict.nn import TensorDictModule
 
+from dynmap_rl.data.features import compute_features
 from dynmap_rl.data.recording.plans import Plan, roll_out
 from dynmap_rl.envs.scene import scene_seed
 from dynmap_rl.experts.network import list_checkpoints
-from dynmap_rl.training.dagger import collect_corrections
+from dynmap_rl.modules.checkpoints import make_policy
+from dynmap_rl.runs.folder import read_metrics
+from dynmap_rl.training import PolicyTraining, train_policies
+from dynmap_rl.training.dagger import add_corrections, collect_corrections
 
 
 class Replay(torch.nn.Module):
@@ -32,7 +38,7 @@ def test_a_student_that_acts_like_the_expert_is_not_corrected():
     corrected = collect_corrections(student(truth["action"]), "balance_reaching", seeds)
     assert corrected.shape == (2, 120)
     for key in ("pixels", "goal", "action", "expert_action", ("dynamics", "velocity")):
-        assert torch.equal(corrected[key], truth[key]), key
+        torch.testing.assert_close(corrected[key], truth[key], rtol=0, atol=1e-6, msg=str(key))
     assert not corrected["failed"].any()
 
 
@@ -44,3 +50,39 @@ def test_steps_after_a_failure_are_marked():
     failed = corrected["failed"][0, :, 0]
     assert not failed[0] and failed[-1] and failed.int().diff().min() == 0
     assert not torch.equal(corrected["action"], corrected["expert_action"])
+
+
+def test_corrections_join_the_states_and_steps_after_a_failure_are_left_out():
+    model = make_model().requires_grad_(False)
+    policy = make_policy(CONSTANTS, "recurrent", model, width=16)
+    episodes = make_episodes(steps=120)["train"]
+    features = compute_features(model, episodes)
+    both = add_corrections(features, model, policy, "balance_reaching", scenes=2, seed=0)
+    assert len(both) == len(features) + 2
+    assert torch.equal(both["latent"][:-2], features["latent"])
+    assert not torch.equal(both["goal"][-2], both["goal"][-1])
+    other = add_corrections(features, model, policy, "balance_reaching", scenes=2, seed=1)
+    assert not torch.isin(other["goal"][-2:, 0, 0], both["goal"][-2:, 0, 0]).any()
+
+
+def test_training_goes_on_with_the_corrections(tmp_path):
+    settings = PolicyTraining("recurrent", updates=3, batch=2, copies=0, corrections=2, correction_updates=2)
+    train_policies(
+        make_model(),
+        make_episodes(steps=120),
+        CONSTANTS,
+        tmp_path,
+        settings,
+        judge=judge,
+        task="balance_reaching",
+        seeds=(0,),
+    )
+    assert [row["step"] for row in read_metrics(tmp_path / "seed_0")] == [3, 5]
+
+
+def test_corrections_need_an_expert(tmp_path):
+    with pytest.raises(ValueError, match="expert"):
+        train_policies(
+            make_model(), make_episodes(), CONSTANTS, tmp_path, PolicyTraining(corrections=2), judge=judge
+        )
+    assert not any(tmp_path.iterdir())
