@@ -88,7 +88,7 @@ class GlimpseEncoder(Encoder):
         self,
         latent_size: int = 64,
         channels: tuple[int, int] = (32, 48),
-        maps: int = 16,
+        maps: int = 8,
         features: int = 8,
         glimpses: int = 2,
         samples: int = 16,
@@ -107,10 +107,9 @@ class GlimpseEncoder(Encoder):
         self.read = nn.Sequential(nn.Linear(glimpses * 3 * samples**2, width), nn.SiLU())
         self.mlp = nn.Sequential(nn.Linear(pooled + width, width), nn.SiLU(), nn.Linear(width, latent_size))
         self.linear = nn.Linear(pooled + width, latent_size)
-        # Constant products in the place of sums over strided memory, which are several times as slow.
-        self.register_buffer("places", _sub_blocks(make_grid(32)))  # (1024, 2)
+        # A constant product in the place of sums over strided memory, which are several times as slow.
+        self.register_buffer("places", _split_blocks(make_grid(32).permute(2, 0, 1)[None]).mT)  # (1, 1024, 2)
         self.register_buffer("average", _averages())  # (48, 4 * 3)
-        self.register_buffer("gather", torch.eye(maps).repeat(SUB**2, 1))  # (4 K, K)
 
     def encode(self, x: torch.Tensor) -> torch.Tensor:
         count = len(x)
@@ -119,18 +118,16 @@ class GlimpseEncoder(Encoder):
         blocks = to_blocks(x).to(dtype) / 255 - 0.5  # (N, 48, 16, 16)
         h = self.mix(self.stem(blocks).relu())
         h = (h + F.interpolate(self.context(h.relu()), scale_factor=2)).relu()
-        # In channels-last memory the next lines only change the view.
-        logits = self.attend(h).permute(0, 2, 3, 1).reshape(count, -1, self.maps)  # (N, 1024, K)
-        attention = (logits.float() + _rarity(x)).softmax(1)
-        colors = (blocks.permute(0, 2, 3, 1).reshape(count, 256, -1).float() @ self.average).view(
-            count, -1, 3
-        )
+        # One row of memory for each map: SUB x SUB places in a block, then the blocks.
+        logits = self.attend(h).float().contiguous().view(count, self.maps, -1)  # (N, K, 1024)
+        attention = (logits + _rarity(x)).softmax(-1)
+        colors = blocks.permute(0, 2, 3, 1).reshape(count, 256, -1).float() @ self.average
+        colors = colors.view(count, 256, SUB**2, 3).transpose(1, 2).reshape(count, -1, 3)
         mean = colors.mean(1)
-        values = torch.cat([self.places.expand(count, -1, -1), colors], -1)
-        where = attention.transpose(1, 2) @ values  # (N, K, 5)
-        of_blocks = attention.view(count, 256, -1) @ self.gather  # (N, 256, K)
+        where = attention @ torch.cat([self.places.expand(count, -1, -1), colors], -1)  # (N, K, 5)
+        of_blocks = attention.view(count, self.maps, SUB**2, -1).sum(2)  # (N, K, 256)
         features = self.features(h).permute(0, 2, 3, 1).reshape(count, 256, -1).float()
-        what = of_blocks.transpose(1, 2) @ features  # (N, K, features)
+        what = of_blocks @ features  # (N, K, features)
         glimpses = self.look(x.float(), where[:, : self.glimpses, :2], 255 * (mean + 0.5)) / 255
         values = 2 * where.flatten(1), what.flatten(1), 3 * mean, self.read(2 * glimpses.flatten(1))
         pooled = torch.cat(values, -1)
@@ -158,9 +155,9 @@ class GlimpseEncoder(Encoder):
 SUB = 2  # attention maps have SUB x SUB places in a block
 
 
-def _sub_blocks(grid: torch.Tensor) -> torch.Tensor:
-    """Reorder values of the places of a map, ``[32, 32, C]``, block by block, ``[1024, C]``."""
-    return grid.unflatten(0, (-1, SUB)).unflatten(2, (-1, SUB)).transpose(1, 2).reshape(-1, grid.shape[-1])
+def _split_blocks(maps: torch.Tensor) -> torch.Tensor:
+    """Order maps ``[N, C, 32, 32]`` by the place in a block, then by the block, ``[N, C, 1024]``."""
+    return F.pixel_unshuffle(maps, SUB).flatten(2).view(*maps.shape[:2], -1)
 
 
 def _averages() -> torch.Tensor:
@@ -173,6 +170,5 @@ def _averages() -> torch.Tensor:
 
 @torch.no_grad()
 def _rarity(x: torch.Tensor) -> torch.Tensor:
-    """Return the logarithm of the mean rarity of the colours at the places of a map, ``[N, 1024, 1]``."""
-    weights = F.avg_pool2d(color_weights(x, 0.75)[:, None], BLOCK // SUB)  # (N, 1, 32, 32)
-    return F.pixel_unshuffle(weights, SUB).permute(0, 2, 3, 1).reshape(len(x), -1, 1).log()
+    """Return the logarithm of the mean rarity of the colours at the places of a map, ``[N, 1, 1024]``."""
+    return _split_blocks(F.avg_pool2d(color_weights(x, 0.75)[:, None], BLOCK // SUB)).log()

@@ -38,7 +38,7 @@ class WorldModelTraining(WorldModelArchitecture):
     """Form and training of a world model (paper, Eq. 4a and 5)."""
 
     # Optimiser steps.
-    updates: int = 1500
+    updates: int = 1000
     # Windows in a batch.
     windows: int = 12
     # Time steps of a window.

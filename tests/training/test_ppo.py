@@ -41,7 +41,10 @@ def finished(tmp_path_factory):
 
 
 def test_checkpoints_and_metrics(finished):
-    assert [(row["step"], row["frames"]) for row in metrics(finished)] == [(1, 240), (2, 480)]
+    assert [(row["step"], row["frames"]) for row in metrics(finished)] == [
+        (1, 2 * SETTINGS.steps),
+        (2, 4 * SETTINGS.steps),
+    ]
     facts = [read_json(finished / f"checkpoint/iteration_00{i}.json") for i in (1, 2)]
     assert [(f["iteration"], f["episodes"], f["task"]) for f in facts] == [(1, 3, "mine"), (2, 4, "mine")]
     first, last = (load_file(finished / f"checkpoint/iteration_00{i}.safetensors") for i in (1, 2))
