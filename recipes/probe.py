@@ -7,7 +7,7 @@ On held-out demonstrations with their actions, every world model that decodes po
 predicts two more without (mm and degrees, beside a constant prediction). Linear maps from each state to position,
 velocity and acceleration are fitted to training demonstrations (R^2 on held-out ones). What the world models see is
 measured on held-out demonstrations and on the expert's first ten steps in validation scenes: colours of objects and goal
-in predicted frames, and the cart's position by a linear map of the latent. The folder of the results gets two figures,
+in predicted frames, and the cart's position by a linear map of the latent. The folder of the results gets three figures,
 ``probe.json`` and ``report.html``.
 """
 
@@ -49,7 +49,7 @@ def main(config: Config) -> None:
     from dynmap_rl.evaluation.open_loop import open_loop_errors
     from dynmap_rl.evaluation.perception import begin_scenes, color_errors, locate_cart
     from dynmap_rl.evaluation.probing import probe
-    from dynmap_rl.reporting.figures import plot_open_loop, plot_probes
+    from dynmap_rl.reporting.figures import plot_open_loop, plot_perception, plot_probes
     from dynmap_rl.reporting.html import write_html
     from dynmap_rl.runs.folder import plain_settings
     from dynmap_rl.training.dataset import find_or_record
@@ -83,6 +83,7 @@ def main(config: Config) -> None:
     if open_loop:
         plot_open_loop(open_loop, config.output / "open_loop.png")
     plot_probes(probes, config.output / "probes.png")
+    plot_perception(models, test[:8], config.output / "perception.png")
     command = command_line(sys.argv)
     write_html(config.output, "States and predictions of world models", text, command, plain_settings(config))
     facts = {"command": command, "train_episodes": len(train), "test_episodes": len(test)}
@@ -102,6 +103,8 @@ def load_world_models(runs: list[str]) -> dict:
     for run in runs:
         world_model, source = load_source(run.strip())
         name = f"{row_name(world_model.supervision, source['training'])}, {source['training']}"
+        if world_model.architecture == "plain":
+            name += ", plain"
         if name in models:
             raise ValueError(f"--runs must be of different rows, got {name} twice")
         models[name] = world_model

@@ -73,6 +73,34 @@ def plot_prediction(world_model: WorldModel, episodes: TensorDictBase, path: Pat
     save_figure(figure, path)
 
 
+def plot_perception(
+    world_models: dict[str, WorldModel], episodes: TensorDictBase, path: Path, steps=(2, 20)
+) -> None:
+    """Draw frames of episodes ``[E, T]`` and, below, what each world model predicted from the frame before.
+
+    Args:
+        world_models: by name.
+        episodes: one column each.
+        path: file to write.
+        steps: time steps, from the top.
+    """
+    rows = {"frame": episodes["pixels"] / 255}
+    rows |= {
+        name: predict(model, episodes)["reconstruction", "pixels"] for name, model in world_models.items()
+    }
+    shape = len(steps) * len(rows), len(episodes)
+    figure, axes = plt.subplots(
+        *shape, figsize=(1.1 * shape[1] + 1.5, 1.1 * shape[0]), squeeze=False, layout="constrained"
+    )
+    shown = [(name, frames[:, t]) for t in steps for name, frames in rows.items()]
+    for row, (name, frames) in zip(axes, shown, strict=True):
+        for axis, frame in zip(row, frames, strict=True):
+            axis.imshow(frame.clamp(0, 1).permute(1, 2, 0).numpy())
+            axis.set(xticks=[], yticks=[])
+        row[0].set_ylabel(name.replace(", ", "\n"), rotation=0, ha="right", va="center", fontsize=8)
+    save_figure(figure, path)
+
+
 def draw_reconstruction(figure, out: TensorDictBase, steps: list[list[int]]) -> None:
     """Draw frames of episodes ``[E, T]`` (see :func:`predict`) and their predictions at the ``steps`` of each."""
     axes = figure.subplots(2 * len(out), len(steps[0]), squeeze=False)

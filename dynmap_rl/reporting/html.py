@@ -23,6 +23,7 @@ PICTURES = {  # in this order
     "figures/dynamics.png": "The block's dynamics along a held-out episode, true and predicted",
     "open_loop.png": "Error of open-loop predictions against the time without frames",
     "probes.png": "R^2 of linear maps from the states to the dynamics",
+    "perception.png": "Held-out demonstrations, and what each world model predicted from the frame before",
     "episodes.gif": "Some of the episodes",
     "dynamics.png": "The dynamics of the first episode",
 }

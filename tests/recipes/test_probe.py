@@ -36,10 +36,10 @@ def test_writes_errors_and_probes_of_every_world_model(trained, recording, tmp_p
                 and values["object_error"] > 0.05
                 and values["cart_error"] > 0
             )
-    for name in ("open_loop", "probes"):
+    for name in ("open_loop", "probes", "perception"):
         assert (tmp_path / f"runs/probe/{name}.png").stat().st_size > 10_000
     page = (tmp_path / "runs/probe/report.html").read_text()
-    assert page.count("data:image/png") == 2 and all(line in page for line in result.stdout.splitlines()[:-1])
+    assert page.count("data:image/png") == 3 and all(line in page for line in result.stdout.splitlines()[:-1])
 
 
 @pytest.mark.parametrize(
