@@ -96,9 +96,9 @@ class PolicyTraining(PolicyArchitecture):
     """Form and training of a policy on the states of a frozen world model."""
 
     # Optimiser steps.
-    updates: int = 2500
+    updates: int = 1500
     # Episodes in a batch.
-    batch: int = 32
+    batch: int = 16
     # Copies of every demonstration, each from a random step on.
     copies: int = 2
     # Permute the colour channels of the copies.
