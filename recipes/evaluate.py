@@ -54,6 +54,7 @@ def main(config: Config) -> None:
     from dynmap_rl.reporting.html import write_html
     from dynmap_rl.runs.folder import plain_settings
     from dynmap_rl.utils.files import write_json
+    from dynmap_rl.utils.version import find_commit
 
     refuse(config.eval, Evaluation(paper_episodes=0), ["paper_episodes"], "recipes/evaluate.py", "eval.")
     if config.policy:
@@ -66,7 +67,8 @@ def main(config: Config) -> None:
     who = f"Policy {config.policy}" if config.policy else f"Expert {result['expert']}"
     command = command_line(sys.argv)
     write_html(folder, f"{who}, {result['task']}", text, command, plain_settings(config))
-    common = {"split": config.eval.split, "episodes": config.eval.episodes, "command": command}
+    common = {"split": config.eval.split, "episodes": config.eval.episodes}
+    common |= {"command": command, "commit": find_commit()}
     output = config.output or folder / "eval.json"
     write_json(output, result | common)
     print(f"written: {output}, {folder / 'report.html'}")

@@ -53,6 +53,7 @@ def main(config: Config) -> None:
     from dynmap_rl.training.ppo import train_ppo
     from dynmap_rl.utils.devices import seed_everything
     from dynmap_rl.utils.files import read_json, write_json
+    from dynmap_rl.utils.version import find_commit
     from dynmap_rl.utils.weights import fingerprint
 
     if config.pretrained is None:
@@ -97,6 +98,7 @@ def main(config: Config) -> None:
         "latents": read_json(folder / "checkpoint" / f"iteration_{ppo.iterations:03d}.json"),
         "states": states | {"expert": config.expert or config.task},
         "command": command_line(sys.argv),
+        "commit": find_commit(),
     }
     seeds = fresh_scenes(ppo.eval_episodes)
     success = [task.is_success(world) for world in roll_out(network, world_model, config.task, seeds)]

@@ -54,6 +54,7 @@ def main(config: Config) -> None:
     from dynmap_rl.runs.folder import plain_settings
     from dynmap_rl.training.dataset import find_or_record
     from dynmap_rl.utils.files import write_json
+    from dynmap_rl.utils.version import find_commit
 
     models = load_world_models(config.runs.split(","))
     dataset = config.dataset or find_or_record("balance_reaching")
@@ -86,7 +87,12 @@ def main(config: Config) -> None:
     plot_perception(models, test[:8], config.output / "perception.png")
     command = command_line(sys.argv)
     write_html(config.output, "States and predictions of world models", text, command, plain_settings(config))
-    facts = {"command": command, "train_episodes": len(train), "test_episodes": len(test)}
+    facts = {
+        "command": command,
+        "commit": find_commit(),
+        "train_episodes": len(train),
+        "test_episodes": len(test),
+    }
     write_json(
         config.output / "probe.json",
         facts | {"open_loop": open_loop, "probes": probes, "perception": perception},

@@ -12,6 +12,7 @@ from dynmap_rl.data.robot import describe_robot_dataset
 from dynmap_rl.modules.supervision import row_name
 from dynmap_rl.modules.world_model import WorldModel
 from dynmap_rl.utils.files import write_json
+from dynmap_rl.utils.version import find_commit
 
 from .html import write_html
 from .run_page import read_results
@@ -78,6 +79,7 @@ def write_robot_report(
         "spread": {q: dict(zip(own, _spread(episodes, q), strict=True)) for q, own in names.items()},
         "settings": settings,
         "command": command,
+        "commit": find_commit(),
         "results": results,
     }
     plot_reconstruction(world_model.cpu(), episodes[:3], folder / "figures" / "reconstruction.png")

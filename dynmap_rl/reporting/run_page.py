@@ -17,6 +17,7 @@ from dynmap_rl.modules.checkpoints import load_policy
 from dynmap_rl.modules.supervision import row_name
 from dynmap_rl.modules.world_model import WorldModel
 from dynmap_rl.utils.files import read_json, write_json
+from dynmap_rl.utils.version import find_commit
 
 from .html import write_html
 from .media import film_policy
@@ -79,6 +80,7 @@ def write_report(
         | _localization(results),
         "settings": settings,
         "command": command,
+        "commit": find_commit(),
         "results": results,
     }
     _draw(folder, world_model, episodes, result)

@@ -112,11 +112,12 @@ def draw_distributions(config: Config, datasets: dict) -> None:
     """Draw the distributions of angles and angular velocities."""
     from dynmap_rl.reporting.figures import plot_distributions
     from dynmap_rl.utils.files import write_json
+    from dynmap_rl.utils.version import find_commit
 
     dynamics = {task: load_episodes(config, datasets, task, "train")["dynamics"] for task in datasets}
     ranges = plot_distributions(dynamics, config.output / "distributions.png")
     names = [str(folder) for folder in datasets.values()]
-    facts = {"command": command_line(sys.argv), "datasets": names, "ranges": ranges}
+    facts = {"command": command_line(sys.argv), "commit": find_commit(), "datasets": names, "ranges": ranges}
     write_json(config.output / "distributions.json", facts)
 
 

@@ -1,0 +1,29 @@
+"""The commit of the code, for results."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+
+
+def find_commit(root: Path = ROOT) -> str | None:
+    """Return the commit of a checkout, with ``-dirty`` where Python files differ from it; None outside of a checkout.
+
+    Args:
+        root: top folder of the checkout, by default the one that this package is imported from.
+    """
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(root), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        if Path(git("rev-parse", "--show-toplevel")) != root.resolve():
+            return None  # installed inside of another project's checkout
+        return git("rev-parse", "--short=12", "HEAD") + (
+            "-dirty" if git("status", "--short", "--", "*.py") else ""
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return None
