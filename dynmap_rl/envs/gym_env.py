@@ -24,8 +24,8 @@ class DynmapEnv(gym.Env):
     Description:
         The block stands on the cart and is held by friction alone. It tips when the cart accelerates faster than
         about ``9.81 * block_width / block_height`` (2.9 to 4.9 m/s^2 in the default ranges), which the cart's limit
-        exceeds: only careful control keeps it up. Sizes, positions and
-        colours change with every episode. An episode lasts 120 steps (6 s). There are three tasks:
+        exceeds: only careful control keeps it up. Sizes, positions and colours change with every episode. An
+        episode lasts 120 steps (6 s). There are three tasks:
         ``balance_reaching`` (task 1: carry the block to the goal), ``balance_reaching_obstacle`` (task 2: the same
         around an obstacle) and ``bin_dropping`` (task 3: tip the block into a bin).
 
