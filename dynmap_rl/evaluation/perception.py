@@ -30,18 +30,15 @@ def color_errors(
 
     Returns:
         ``object_error``, the root mean square error of the colours of cart and block (0 to 1); ``chroma_explained``, the
-        share (R^2) of the variation of their chroma, that is of the channels less their mean; and ``goal_explained``,
-        the share of the goal marker's difference from the background, where the marker is visible. 1 is perfect; 0 is
-        as good as one chroma for all objects, and as no marker.
+        share (R^2) of the variation of their chroma, that is of the channels less their mean; ``goal_explained``, the
+        share of the goal marker's difference from the background, where the marker is visible; and
+        ``background_error``, the root mean square error on all other pixels. Of the shares, 1 is perfect; 0 is as good
+        as one chroma for all objects, and as no marker.
     """
     device = next(world_model.parameters()).device
-    found: dict[str, list[torch.Tensor]] = {
-        "object": [],
-        "object_truth": [],
-        "goal": [],
-        "goal_truth": [],
-        "blank": [],
-    }
+    names = "object", "object_truth", "goal", "goal_truth", "blank"
+    found: dict[str, list[torch.Tensor]] = {name: [] for name in names}
+    rest, pixels = 0.0, 0
     for chunk, some in zip(episodes.split(batch), _split(scenes, batch), strict=True):
         chunk = chunk.to(device)
         latent = world_model.encode(chunk["pixels"], mixed=True)
@@ -58,6 +55,8 @@ def color_errors(
             found[name].append(predicted[mask])
             found[f"{name}_truth"].append(frames[mask] / 255)
         found["blank"].append(background.expand_as(frames)[goal] / 255)
+        others = (predicted - frames / 255)[~(objects | goal)]
+        rest, pixels = rest + others.double().square().sum().item(), pixels + others.numel()
     values = {name: torch.cat(parts).double() for name, parts in found.items()}
     seen, truth = values["object"], values["object_truth"]
     chroma, true_chroma = (x - x.mean(-1, keepdim=True) for x in (seen, truth))
@@ -65,6 +64,7 @@ def color_errors(
         "object_error": (seen - truth).square().mean().sqrt().item(),
         "chroma_explained": _explained(chroma, true_chroma, true_chroma.mean(0)),
         "goal_explained": _explained(values["goal"], values["goal_truth"], values["blank"]),
+        "background_error": (rest / pixels) ** 0.5,
     }
 
 

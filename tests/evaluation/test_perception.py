@@ -6,7 +6,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from dynmap_rl.data.demonstrations import load_dataset, load_meta
-from dynmap_rl.envs.scene import Scene, scene_seed
+from dynmap_rl.envs.scene import GOAL_COLOR, Scene, scene_seed
 from dynmap_rl.evaluation import perception as module
 from dynmap_rl.evaluation.perception import begin_scenes, color_errors, locate_cart
 
@@ -36,7 +36,8 @@ def held_out(recording):
 
 def test_perfect_frames_explain_everything(held_out):
     found = color_errors(Painter(lambda frames: frames), *held_out, batch=1)
-    assert found == pytest.approx({"object_error": 0, "chroma_explained": 1, "goal_explained": 1}, abs=1e-6)
+    perfect = {"object_error": 0, "chroma_explained": 1, "goal_explained": 1, "background_error": 0}
+    assert found == pytest.approx(perfect, abs=1e-6)
 
 
 def test_grey_frames_explain_no_chroma_and_empty_ones_no_goal(held_out):
@@ -56,6 +57,14 @@ def test_half_of_the_deviation_explains_three_quarters(held_out):
     background = torch.tensor([scene.background_color for scene in scenes])[:, None, :, None, None] / 255
     half = color_errors(Painter(lambda frames: (frames + background) / 2), episodes, scenes)
     assert half["goal_explained"] == pytest.approx(0.75, abs=1e-6)
+    assert half["background_error"] == pytest.approx(0, abs=1e-6)
+
+
+def test_a_goal_painted_everywhere_is_an_error_on_the_background(held_out):
+    green = torch.tensor(GOAL_COLOR)[:, None, None] / 255
+    found = color_errors(Painter(lambda frames: green.expand_as(frames)), *held_out)
+    assert found["goal_explained"] == pytest.approx(1, abs=1e-6)
+    assert found["background_error"] > 0.3
 
 
 def test_the_cart_is_located_where_a_linear_map_puts_it(monkeypatch):
