@@ -28,7 +28,7 @@ from dynmap_rl.utils.devices import Compute
 
 # The symmetries of the tasks' scenes, and the weight of changed actions, need not hold for a robot.
 WORLD_MODEL = WorldModelTraining(augmentation=Augmentation.off())
-POLICY = PolicyTraining(recolor=False, emphasis=0.0)
+POLICY = PolicyTraining(emphasis=0.0)
 JOINT = JointTraining(augmentation=Augmentation.off(), emphasis=0.0)
 
 

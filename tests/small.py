@@ -18,7 +18,7 @@ CONSTANTS = {
 }
 SIZES = {"updates": 6, "windows": 2, "window_steps": 5}
 WORLD_MODEL = WorldModelTraining(supervision="position", rgb_frames=2, learning_rate=1e-3, **SIZES)
-POLICY = PolicyTraining(updates=4, batch=2, copies=1, learning_rate=1e-3)
+POLICY = PolicyTraining(updates=4, batch=2, learning_rate=1e-3)
 JOINT = JointTraining(rgb_frames=2, **SIZES)
 END_TO_END = EndToEndTraining(**SIZES)
 

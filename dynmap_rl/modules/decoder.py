@@ -66,7 +66,7 @@ class SpriteDecoder(nn.Module):
     def __init__(
         self,
         input_size: int,
-        sprites: int = 2,
+        sprites: int = 3,
         side: int = 24,
         colors: int = 6,
         width: int = 256,

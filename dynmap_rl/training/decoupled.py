@@ -93,7 +93,7 @@ def train_policies(
         states = folder / "features"
         shutil.rmtree(states, ignore_errors=True)  # left behind by a kill
         try:
-            _write_features(world_model, episodes, states, settings, compute.device)
+            _write_features(world_model, episodes, states, compute.device)
             run_processes([_train, _evaluate], [(work, seed) for seed in todo], compute.threads)
         finally:
             shutil.rmtree(states, ignore_errors=True)
@@ -116,14 +116,10 @@ class _Work:
     frozen: str
 
 
-def _write_features(world_model, episodes, states: Path, settings: PolicyTraining, device: str) -> None:
+def _write_features(world_model, episodes, states: Path, device: str) -> None:
     device = choose_device(device)
     world_model.to(device)
-    generator = torch.Generator(device).manual_seed(0)
-    train = compute_features(
-        world_model, episodes["train"], settings.copies, generator, recolor=settings.recolor
-    )
-    held_out = compute_features(world_model, episodes["eval"])
+    train, held_out = (compute_features(world_model, episodes[split]) for split in ("train", "eval"))
     check_space(states.parent, train.bytes() + held_out.bytes())
     for name, values in (("train", train), ("eval", held_out)):
         values.cpu().memmap(states / name)

@@ -99,10 +99,6 @@ class PolicyTraining(PolicyArchitecture):
     updates: int = 1500
     # Episodes in a batch.
     batch: int = 16
-    # Copies of every demonstration, each from a random step on.
-    copies: int = 2
-    # Permute the colour channels of the copies.
-    recolor: bool = True
     # Peak learning rate (100 steps of warm-up, then a cosine).
     learning_rate: float = 3e-3
     # Extra weight of steps in which the expert changes its action (see imitation_loss); 0 is the paper's plain L1.
@@ -116,7 +112,7 @@ class PolicyTraining(PolicyArchitecture):
     def __post_init__(self):
         super().__post_init__()
         check_at_least(self, 1, "updates", "batch", "correction_updates")
-        check_at_least(self, 0, "copies", "learning_rate", "emphasis", "corrections")
+        check_at_least(self, 0, "learning_rate", "emphasis", "corrections")
 
 
 @dataclass(frozen=True)

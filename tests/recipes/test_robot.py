@@ -23,7 +23,7 @@ def datasets(tmp_path_factory):
 JOINT = ["--method", "joint", "--goal", "observation.state:0,1", "--policy.kind", "feedforward"]
 UNDO = [  # sizes of the preset that have no effect in joint training
     "--world_model.updates=2500", "--world_model.windows=16", "--world_model.window_steps=24",
-    "--world_model.rgb_frames=128", "--policy.updates=2500", "--policy.batch=32", "--policy.copies=2",
+    "--world_model.rgb_frames=128", "--policy.updates=1500", "--policy.batch=16", "--policy.corrections=0",
 ]  # fmt: skip
 SIZES = ["--joint.updates=4", "--joint.windows=2", "--joint.window_steps=6", "--joint.rgb_frames=2"]
 
@@ -74,8 +74,8 @@ def test_a_run_measures_held_out_errors(datasets, tmp_path, method, arguments, g
             "--joint.updates has no effect with --method decoupled",
         ),
         (
-            ["--dataset", "gliding", "--method", "joint", "--policy.copies", "1"],
-            "--policy.copies has no effect",
+            ["--dataset", "gliding", "--method", "joint", "--policy.corrections", "1"],
+            "--policy.corrections has no effect",
         ),
     ],
 )

@@ -171,7 +171,7 @@ CASES = [
         r"--updates; do you mean --world_model\.updates or --policy\.updates\?",
     ),
     (nothing, f"{TRAIN} --world_model.update 3", r"do you mean --world_model\.updates\?"),
-    (nothing, f"{TRAIN} --policy.copies -1", r"copies must be at least 0, got -1"),
+    (nothing, f"{TRAIN} --policy.corrections -1", r"corrections must be at least 0, got -1"),
     (nothing, f"{TRAIN} --world_model.updates many", r"world_model\.updates.*'many'"),
     (nothing, f"{TRAIN} --world_model.supervision speed", "supervision must .*'speed'"),
     (nothing, f"{TRAIN} --policy.kind transformer", "kind must .*'transformer'"),

@@ -29,7 +29,7 @@ def test_a_training_step_does_not_wait_for_the_gpu(recording, trained):
     model = make_world_model(constants, ("position",)).cuda()
     policy = make_policy(constants, "recurrent", model).cuda()
     generator = torch.Generator("cuda").manual_seed(0)
-    features = compute_features(model, episodes, 1, generator).to("cuda")
+    features = compute_features(model, episodes).to("cuda")
     world_model_loss = WorldModelLoss(model, rgb_frames=2)
     loss_module = {
         "world_model": world_model_loss,
@@ -64,7 +64,7 @@ def test_training_and_control_end_to_end(recording, tmp_path):
     model = make_world_model(constants, ("position",)).cuda()
     train_world_model(model, episodes, tmp_path, WORLD_MODEL)
     model.eval().requires_grad_(False)
-    features = compute_features(model, episodes["train"], 1, torch.Generator("cuda").manual_seed(0))
+    features = compute_features(model, episodes["train"])
     policy = make_policy(constants, "recurrent", model).cuda()
     train_policy(policy, features, features, tmp_path / "policy", POLICY)
     rollout = roll_out(Actor(model, policy), "balance_reaching", scene_seeds("validation", 2))

@@ -66,7 +66,7 @@ def test_corrections_join_the_states_and_steps_after_a_failure_are_left_out():
 
 
 def test_training_goes_on_with_the_corrections(tmp_path):
-    settings = PolicyTraining("recurrent", updates=3, batch=2, copies=0, corrections=2, correction_updates=2)
+    settings = PolicyTraining("recurrent", updates=3, batch=2, corrections=2, correction_updates=2)
     train_policies(
         make_model(),
         make_episodes(steps=120),

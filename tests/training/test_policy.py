@@ -1,7 +1,6 @@
 """Training of a policy on the states of a frozen world model."""
 
 import pytest
-import torch
 from small import CONSTANTS, POLICY, make_episodes, make_model
 
 from dynmap_rl.data.features import compute_features
@@ -18,9 +17,7 @@ def model():
 
 @pytest.fixture
 def features(model):
-    return compute_features(
-        model, make_episodes()["train"], copies=1, generator=torch.Generator().manual_seed(0)
-    )
+    return compute_features(model, make_episodes()["train"])
 
 
 @pytest.mark.parametrize("kind", ["recurrent", "feedforward"])

@@ -32,7 +32,7 @@ def test_settings_are_frozen_and_hashable(kind):
         (WorldModelTraining, {"window_steps": 1}),
         (WorldModelTraining, {"learning_rate": -1e-3}),
         (PolicyTraining, {"kind": "transformer"}),
-        (PolicyTraining, {"copies": -1}),
+        (PolicyTraining, {"corrections": -1}),
         (JointTraining, {"beta_joint": -1}),
         (JointTraining, {"windows": 0}),
         (PPOTraining, {"epochs": 0}),
