@@ -34,7 +34,7 @@ class Config:
     # Seeds of the policies.
     seeds: str = "0,1,2"
     # Policies.
-    policy: PolicyTraining = PolicyTraining(updates=4000)
+    policy: PolicyTraining = PolicyTraining(updates=3000)
     # Evaluation in closed loop.
     eval: Evaluation = Evaluation()
     # Device and cores.

@@ -104,7 +104,7 @@ def test_keys_move_at_the_limit_of_speed():
     hand.direction = np.array([1.0, 0.0, -1.0])
     for _ in range(40):
         action = hand.action(np.zeros(3), action)
-    np.testing.assert_allclose(action, [0.02, 0, -0.05])
+    np.testing.assert_allclose(action, [0.04, 0, -0.1])
 
 
 def test_the_next_scene_begins_anew(actor):
