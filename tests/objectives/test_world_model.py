@@ -121,5 +121,5 @@ def test_the_latent_loss_of_imagined_windows_moves_the_predicted_change_alone():
     model, loss = make((), beta_z=1.0, imagined=1.0)
     torch.nn.init.zeros_(model.transition.change.weight)
     loss(batch())["loss_latent"].backward()
-    assert model.transition.change.bias.grad.abs().sum() > 0
-    assert all(p.grad is None or p.grad.abs().sum() == 0 for p in model.encoder.parameters())
+    assert model.transition.change.bias.grad.abs().sum() > 0.1
+    assert all(p.grad is None or p.grad.abs().sum() < 1e-5 for p in model.encoder.parameters())

@@ -168,7 +168,7 @@ CASES = [
     (
         nothing,
         f"{TRAIN} --updates 3",
-        r"--updates; do you mean --world_model\.updates or --policy\.updates\?",
+        r"--updates; do you mean --world_model\.updates or --policy\.updates or",
     ),
     (nothing, f"{TRAIN} --world_model.update 3", r"do you mean --world_model\.updates\?"),
     (nothing, f"{TRAIN} --policy.corrections -1", r"corrections must be at least 0, got -1"),
