@@ -6,6 +6,7 @@ import shutil
 import pytest
 from commands import PRESETS, run, run_small
 
+from dynmap_rl.training.settings import WorldModelTraining
 from dynmap_rl.utils.files import read_json, write_json
 
 NAME = "runs/decoupled/balance_reaching/position_velocity_recurrent"
@@ -82,8 +83,9 @@ def test_policies_on_a_world_model_of_another_run(small):
 
 def options(pretrained):
     """Return options that undo the preset's sizes of the world model, which have no effect with ``--pretrained``."""
-    sizes = {"updates": 2500, "windows": 16, "window_steps": 24, "rgb_frames": 128}
-    return ["--pretrained", pretrained, *(f"--world_model.{name}={size}" for name, size in sizes.items())]
+    sizes = ("updates", "windows", "window_steps", "rgb_frames")
+    defaults = (f"--world_model.{name}={getattr(WorldModelTraining(), name)}" for name in sizes)
+    return ["--pretrained", pretrained, *defaults]
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from robot_dataset import make_robot_dataset
 from dynmap_rl.data.derive import add_dynamics
 from dynmap_rl.modules.checkpoints import load_policy, load_world_model
 from dynmap_rl.runs.folder import read_metrics
+from dynmap_rl.training.settings import PolicyTraining, WorldModelTraining
 from dynmap_rl.utils.files import read_json
 
 
@@ -22,9 +23,12 @@ def datasets(tmp_path_factory):
 
 JOINT = ["--method", "joint", "--goal", "observation.state:0,1", "--policy.kind", "feedforward"]
 UNDO = [  # sizes of the preset that have no effect in joint training
-    "--world_model.updates=2500", "--world_model.windows=16", "--world_model.window_steps=24",
-    "--world_model.rgb_frames=128", "--policy.updates=1500", "--policy.batch=16", "--policy.corrections=0",
-]  # fmt: skip
+    *(
+        f"--world_model.{n}={getattr(WorldModelTraining(), n)}"
+        for n in ("updates", "windows", "window_steps", "rgb_frames")
+    ),
+    *(f"--policy.{n}={getattr(PolicyTraining(), n)}" for n in ("updates", "batch")),
+]
 SIZES = ["--joint.updates=4", "--joint.windows=2", "--joint.window_steps=6", "--joint.rgb_frames=2"]
 
 

@@ -47,7 +47,7 @@ def python(installed, tmp_path):
 def test_weights_and_experts_are_in_the_wheel(python, installed):
     file, *others = python("-c", CODE).split()
     assert Path(file).is_relative_to(installed)
-    assert others == ["128", "[5,", "5,", "5]"]
+    assert others == ["128", "[5,", "4,", "4]"]
 
 
 def test_recipes_run_on_it(python, recording, tmp_path):
