@@ -57,7 +57,8 @@ class SpriteDecoder(nn.Module):
     Args:
         input_size: Z + 2 H.
         sprites: number of sprites; later ones cover earlier ones.
-        side: side of a sprite, in pixels.
+        side: samples of a sprite along each axis.
+        spacing: distance of the samples, in pixels.
         colors: M.
         width: width of the MLPs that paint sprites and mix colours.
         channels: channels of the CNN's maps of stride 8 and 4.
@@ -67,13 +68,14 @@ class SpriteDecoder(nn.Module):
         self,
         input_size: int,
         sprites: int = 3,
-        side: int = 24,
+        side: int = 16,
+        spacing: float = 1.5,
         colors: int = 6,
         width: int = 256,
         channels: tuple[int, int] = (64, 32),
     ):
         super().__init__()
-        self.sprites, self.side = sprites, side
+        self.sprites, self.side, self.spacing = sprites, side, spacing
         self.masks = PlainDecoder(input_size, channels, colors)
         self.colors = nn.Sequential(nn.Linear(input_size, width), nn.SiLU(), nn.Linear(width, 3 * colors))
         self.place = nn.Linear(input_size, sprites * 2)
@@ -108,7 +110,7 @@ class SpriteDecoder(nn.Module):
         color = sprites[..., :3, :] + self.tint(x).float().view(count, self.sprites, 1, 3, 1) + 0.5
         sprites = torch.cat([opacity * color, opacity], -2)
         place = self.place(x).float().view(count, self.sprites, 2)
-        across, down = hat_kernels(place, side).unbind(2)  # (N, S, side, 64)
+        across, down = (self.spacing * hat_kernels(place, side, self.spacing)).unbind(2)  # (N, S, side, 64)
         rows = (down.mT @ sprites.flatten(3)).unflatten(3, (4, side))  # (N, S, 64, 4, side)
         return (rows.flatten(2, 3) @ across).unflatten(2, (64, 4)).transpose(2, 3)
 

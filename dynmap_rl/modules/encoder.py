@@ -115,13 +115,15 @@ class GlimpseEncoder(Encoder):
         count = len(x)
         autocast = torch.is_autocast_enabled(x.device.type)
         dtype = torch.get_autocast_dtype(x.device.type) if autocast else self.linear.weight.dtype
-        blocks = to_blocks(x).to(dtype) / 255 - 0.5  # (N, 48, 16, 16)
-        h = self.mix(self.stem(blocks).relu())
+        blocks = to_blocks(x).to(dtype)  # (N, 48, 16, 16), 0..255
+        # Scaling the weights replaces blocks / 255 - 0.5.
+        weight, bias = self.stem.weight / 255, self.stem.bias - 0.5 * self.stem.weight.sum((1, 2, 3))
+        h = self.mix(F.conv2d(blocks, weight, bias).relu())
         h = (h + F.interpolate(self.context(h.relu()), scale_factor=2)).relu()
         # One row of memory for each map: SUB x SUB places in a block, then the blocks.
         logits = self.attend(h).float().contiguous().view(count, self.maps, -1)  # (N, K, 1024)
         attention = (logits + _rarity(x)).softmax(-1)
-        colors = blocks.permute(0, 2, 3, 1).reshape(count, 256, -1).float() @ self.average
+        colors = blocks.permute(0, 2, 3, 1).reshape(count, 256, -1).float() @ (self.average / 255) - 0.5
         colors = colors.view(count, 256, SUB**2, 3).transpose(1, 2).reshape(count, -1, 3)
         mean = colors.mean(1)
         where = attention @ torch.cat([self.places.expand(count, -1, -1), colors], -1)  # (N, K, 5)

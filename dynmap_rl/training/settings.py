@@ -38,7 +38,7 @@ class WorldModelTraining(WorldModelArchitecture):
     """Form and training of a world model (paper, Eq. 4a and 5)."""
 
     # Optimiser steps.
-    updates: int = 1000
+    updates: int = 900
     # Windows in a batch.
     windows: int = 12
     # Time steps of a window.
@@ -96,7 +96,7 @@ class PolicyTraining(PolicyArchitecture):
     """Form and training of a policy on the states of a frozen world model."""
 
     # Optimiser steps.
-    updates: int = 1500
+    updates: int = 1200
     # Episodes in a batch.
     batch: int = 16
     # Peak learning rate (100 steps of warm-up, then a cosine).
