@@ -8,9 +8,12 @@ from pathlib import Path
 from dynmap_rl.utils.files import read_json, write_bytes
 
 from .findings import compare_cells, markdown_claims, markdown_comparisons, markdown_spread
+from .published import METRICS
 from .results import COLUMNS
 from .tables import join_table, markdown_column, markdown_overview
 
+UNITS = {"DR": "%", "PE": "mm"}
+PERCEPTION = "object_error", "chroma_explained", "goal_explained", "background_error"
 MARKS = "<!-- results -->", "<!-- /results -->"
 COMMAND = "python recipes/paper/tables.py --write"
 PAGE = """# Results
@@ -63,6 +66,16 @@ the effective number of independent episodes, since a scene that is hard for one
 
 {columns}
 
+## What world models see
+
+One-step predictions of two datasets without distractors: held-out demonstrations, and the expert's first ten steps in
+validation scenes, where the cart is away from the goal. Colour error: root mean square on the pixels of cart and block (of
+0 to 1). Chroma: share of the variation of the objects' chroma that is explained. Goal: share of the marker's difference
+from the background. Background: root mean square error on all other pixels. Cart: distance of a linear map of the latent.
+Open loop: distance of the decoded positions of cart and block after two seconds without frames.
+
+{perception}
+
 ## Pictures
 
 {media}
@@ -95,9 +108,27 @@ def markdown_page(results: Path) -> str:
         spread=markdown_spread(cells),
         comparisons=markdown_comparisons(comparisons),
         columns="\n\n".join(columns),
+        perception=markdown_perception(read_json(results / "measurements" / "probe.json")),
         media="\n\n".join(f"![{text}](media/{name})\n\n{text}" for name, text in contents["media"].items()),
         measurements=_measurements(results / "measurements", contents["measurements"]),
     )
+
+
+def markdown_perception(probe: dict) -> str:
+    """Return a table of what the world models of a ``probe.json`` see (see ``recipes/probe.py``)."""
+    lines = []
+    for name, places in probe["perception"].items():
+        for where, found in places.items():
+            last = {
+                key: values[-1] for key, values in probe["open_loop"].get(name, {}).get("model", {}).items()
+            }
+            held_out = where == "held-out demonstrations" and last
+            lines.append([
+                name, where, *(f"{found[key]:.2f}" for key in PERCEPTION), f"{1000 * found['cart_error']:.1f} mm",
+                f"{last['cart_mm']:.1f} mm, {last['block_mm']:.1f} mm" if held_out else "",
+            ])  # fmt: skip
+    head = ["", "on", "colour error", "chroma", "goal", "background", "cart", "open loop: cart, block"]
+    return join_table(head, lines)
 
 
 def replace_block(text: str, block: str) -> str:
@@ -141,10 +172,12 @@ def _measurements(folder: Path, contents: dict[str, dict]) -> str:
 
 
 def _headline(result: dict) -> str:
-    """Return the success rate of a measurement that has one."""
+    """Return the success rate of a measurement that has one, with the other metrics of the task."""
     if summary := result.get("summary") or result.get("test_protocol"):
         low, high = summary["SR_interval"]
-        return f"SR {summary['SR']:.1f} % [{low:.1f}, {high:.1f}]"
+        names = [name for name in METRICS.get(result["task"], ()) if name in UNITS]
+        others = [f"{name} {summary[name]:.1f} {UNITS[name]}" for name in names]
+        return ", ".join([f"SR {summary['SR']:.1f} % [{low:.1f}, {high:.1f}]", *others])
     if rates := result.get("rates"):
         low, high = result["intervals"]["success"]
         return f"success {rates['success']:.1f} % [{low:.1f}, {high:.1f}]"
