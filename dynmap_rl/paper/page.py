@@ -7,6 +7,7 @@ from pathlib import Path
 
 from dynmap_rl.utils.files import read_json, write_bytes
 
+from .cells import TASKS
 from .findings import compare_cells, markdown_claims, markdown_comparisons, markdown_spread
 from .published import METRICS
 from .results import COLUMNS
@@ -131,6 +132,41 @@ def markdown_perception(probe: dict) -> str:
     return join_table(head, lines)
 
 
+def markdown_runs(measurements: Path) -> str:
+    """Return a table of the runs in a folder of measurements, ``v1_*.json``, and of the careless baseline."""
+    lines = []
+    for path in sorted(measurements.glob("v1_*.json")):
+        run, reported = read_json(path), METRICS[read_json(path)["task"]]
+        test, (low, high) = run["test_protocol"], run["test_protocol"]["SR_interval"]
+        others = (f"{test[name]:.1f}" if name in reported else "" for name in UNITS)
+        who = f"{run['row']}, {run['policy']}"
+        scenes = f"{test['episodes']:,} {run['settings']['eval']['split']}"
+        lines.append(
+            [run["task"], who, scenes, *others, f"**{test['SR']:.1f}** [{low:.1f}, {high:.1f}]", _link(path)]
+        )
+    for path in sorted(measurements.glob("careless_*.json")):
+        run = read_json(path)
+        rates, scenes = run["rates"], f"{run['episodes']:,} {run['split']}"
+        lines.append(
+            [
+                run["task"],
+                "careless",
+                scenes,
+                f"{rates['dropped']:.1f}",
+                "",
+                f"{rates['success']:.1f}",
+                _link(path),
+            ]
+        )
+    lines.sort(key=lambda line: TASKS.index(line[0]))
+    rows = [[str(1 + TASKS.index(task)), *line] for task, *line in lines]
+    return join_table(["task", "world model, policy", "episodes", "DR %", "PE mm", "SR %", ""], rows)
+
+
+def _link(path: Path) -> str:
+    return f"[file](recipes/results/measurements/{path.name})"
+
+
 def replace_block(text: str, block: str) -> str:
     """Return a text in which a block stands between the two marks; a text without marks is returned as it is."""
     start, end = MARKS
@@ -140,7 +176,7 @@ def replace_block(text: str, block: str) -> str:
 
 
 def write_results_page(results: Path, readme: Path) -> list[Path]:
-    """Write the README of a folder of results, and the overview in the main README.
+    """Write the README of a folder of results, and the table of runs in the main README.
 
     Args:
         results: see :func:`markdown_page`.
@@ -151,7 +187,7 @@ def write_results_page(results: Path, readme: Path) -> list[Path]:
     """
     pages = {results / "README.md": markdown_page(results)}
     if readme.exists():
-        pages[readme] = replace_block(readme.read_text(), markdown_overview(results / "cells"))
+        pages[readme] = replace_block(readme.read_text(), markdown_runs(results / "measurements"))
     changed = [path for path, text in pages.items() if not path.exists() or path.read_text() != text]
     for path in changed:
         write_bytes(path, pages[path].encode())

@@ -10,9 +10,16 @@ from dynmap_rl.evaluation.protocol import result_rows
 from dynmap_rl.evaluation.statistics import shared_interval
 from dynmap_rl.paper import page
 from dynmap_rl.paper.cells import list_cells
-from dynmap_rl.paper.page import MARKS, markdown_page, replace_block, write_results_page
+from dynmap_rl.paper.page import (
+    MARKS,
+    markdown_page,
+    markdown_perception,
+    markdown_runs,
+    replace_block,
+    write_results_page,
+)
 from dynmap_rl.paper.results import COLUMNS, ROWS, read_cells
-from dynmap_rl.paper.tables import markdown_overview, markdown_tables, table_rows
+from dynmap_rl.paper.tables import markdown_tables, table_rows
 from dynmap_rl.utils.files import read_json
 
 ROOT = Path(__file__).parents[2]
@@ -44,7 +51,7 @@ def test_all_but_the_comparisons_of_that_readme_is_generated(monkeypatch):
 
 def test_the_table_of_the_main_readme_is_generated():
     text = (ROOT / "README.md").read_text()
-    assert text == replace_block(text, markdown_overview(RESULTS / "cells")) and MARKS[0] in text
+    assert text == replace_block(text, markdown_runs(RESULTS / "measurements")) and MARKS[0] in text
 
 
 def test_everything_is_described():
@@ -82,6 +89,36 @@ def test_a_cell_without_the_papers_protocol_or_result_is_a_dash(tmp_path, cells)
     lines = markdown_tables(tmp_path).splitlines()
     assert any(line.startswith("| RGB+[V] | 40 (2.8) | - | **") for line in lines)
     assert any(line.startswith("| Only-RGB | 21 / - | 73 / - |") for line in lines)
+
+
+def test_perception_is_a_row_for_each_model_and_dataset():
+    found = {"object_error": 0.1, "chroma_explained": 0.8, "goal_explained": 0.9, "background_error": 0.05}
+    places = dict.fromkeys(("held-out demonstrations", "first ten steps"), found | {"cart_error": 0.012})
+    probe = {
+        "perception": {"RGB+[P], decoupled": places, "Only-RGB, decoupled": places},
+        "open_loop": {"RGB+[P], decoupled": {"model": {"cart_mm": [1, 8.44], "block_mm": [2, 9.0]}}},
+    }
+    lines = markdown_perception(probe).splitlines()[2:]
+    assert lines[0] == (
+        "| RGB+[P], decoupled | held-out demonstrations | 0.10 | 0.80 | 0.90 | 0.05 | 12.0 mm | 8.4 mm, 9.0 mm |"
+    )
+    assert len(lines) == 4 and all(line.endswith("| 12.0 mm |  |") for line in lines[1:])
+
+
+def test_runs_and_the_careless_baseline_are_rows(tmp_path):
+    summary = {"episodes": 3000, "DR": 1.0, "PE": 12.34, "SR": 97.0, "SR_interval": [96.0, 98.0]}
+    run = {"task": "bin_dropping", "row": "Only-RGB", "policy": "recurrent", "test_protocol": summary}
+    (tmp_path / "v1_x.json").write_text(json.dumps(run | {"settings": {"eval": {"split": "validation"}}}))
+    rates = {
+        "task": "balance_reaching",
+        "rates": {"dropped": 90.6, "success": 9.4},
+        "episodes": 1000,
+        "split": "test",
+    }
+    (tmp_path / "careless_x.json").write_text(json.dumps(rates))
+    first, second = markdown_runs(tmp_path).splitlines()[2:]
+    assert first.startswith("| 1 | careless | 1,000 test | 90.6 |  | 9.4 | ")
+    assert second.startswith("| 3 | Only-RGB, recurrent | 3,000 validation |  |  | **97.0** [96.0, 98.0] | ")
 
 
 def test_only_the_block_between_the_marks_is_replaced(tmp_path, monkeypatch):
