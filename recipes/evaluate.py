@@ -3,6 +3,7 @@
     python recipes/evaluate.py --policy balance_reaching                             # ships with the package
     python recipes/evaluate.py --policy runs/decoupled/balance_reaching/position_velocity_recurrent
     python recipes/evaluate.py --policy runs/act/checkpoints/last/pretrained_model   # any LeRobot policy
+    python recipes/evaluate.py --policy balance_reaching --delay 6 --jitter 2 --lost 0.1     # late and lost frames
     python recipes/evaluate.py --expert balance_reaching --task balance_reaching_obstacle
     python recipes/evaluate.py --expert careless                                     # ignores the block
 
@@ -13,7 +14,7 @@ runs/evaluate gets the numbers and a page with some of the episodes, failures fi
 """
 
 import sys
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from dynmap_rl.evaluation.settings import Evaluation
@@ -34,6 +35,14 @@ class Config:
     # Task: balance_reaching, balance_reaching_obstacle, bin_dropping, or module:Class of your own; by default that of
     # the run, otherwise balance_reaching.
     task: str | None = None
+    # Delay of the frames in control steps of 50 ms. The world model imagines the steps up to the present.
+    delay: int = 0
+    # Largest deviation from --delay, in control steps; frames then arrive out of order and in bursts.
+    jitter: int = 0
+    # Probability that a frame is lost.
+    lost: float = 0.0
+    # Act on the newest frame that has arrived as if it were of the present, for comparison.
+    stale: bool = False
     # Expert: the task that a shipped expert belongs to, a folder of checkpoints, or careless, a baseline that ignores the
     # block; by default the task's own expert.
     expert: str | None = None
@@ -60,7 +69,8 @@ def main(config: Config) -> None:
     if config.policy:
         refuse(config, Config(), ["expert", "checkpoint"], "--policy")
     else:
-        refuse(config, Config(), ["seed", "trust_remote_code"], "an expert")
+        names = ["seed", "trust_remote_code", "delay", "jitter", "lost", "stale"]
+        refuse(config, Config(), names, "an expert")
     torch.set_num_threads(config.compute.threads)
     folder, text, result = (judge_policy if config.policy else judge_expert)(config)
     print(text)
@@ -86,18 +96,47 @@ def judge_policy(config: Config) -> tuple[Path, str, dict]:
     from dynmap_rl.reporting.media import film_policy
     from dynmap_rl.runs.lookup import find_run, task_of_run
 
+    delay = read_delay(config)
     folder = find_run(config.policy)
     task = config.task or task_of_run(folder) or "balance_reaching"
     description = get_task(task, from_file=not config.task).description
     actor = load_policy(config, folder, description)
-    result = evaluate(actor, task, config.eval)["test"]
+    if delay and not config.stale:
+        actor = imagine_present(actor, delay)
+    result = evaluate(actor, task, config.eval, delay)["test"]
     summary = result["summary"]
     low, high = summary["SR_interval"]
     text = f"DR {summary['DR']:.1f} %   PE {summary['PE']:.1f} mm   SR {summary['SR']:.1f} % [{low:.1f}, {high:.1f}]"
-    parts = Path(config.policy).parts[-4:]
-    folder = name_folder(config, get_task(task).name, *parts, f"seed_{config.seed}")
-    film_policy(actor, task, result["rows"], folder / "rollouts.gif")
+    parts = [*Path(config.policy).parts[-4:], f"seed_{config.seed}"]
+    if delay:
+        parts += [f"delay_{delay.steps}_{delay.jitter}_{delay.lost}", *(["stale"] if config.stale else [])]
+        result |= {"delay": asdict(delay), "stale": config.stale}
+    folder = name_folder(config, get_task(task).name, *parts)
+    film_policy(actor, task, result["rows"], folder / "rollouts.gif", delay)
     return folder, text, {"task": task, "policy": config.policy, **result}
+
+
+def read_delay(config: Config):
+    """Return the delay of the frames, or None without one."""
+    from dynmap_rl.envs.delay import FrameDelay
+
+    delay = FrameDelay(config.delay, config.jitter, config.lost)
+    if delay == FrameDelay():
+        refuse(config, Config(), ["stale"], "frames in time")
+        return None
+    return delay
+
+
+def imagine_present(actor, delay):
+    """Return the actor whose world model imagines the steps up to the present."""
+    from dynmap_rl.modules.actor import Actor
+    from dynmap_rl.modules.delayed_actor import DelayedActor
+
+    if not isinstance(actor, Actor):
+        raise ValueError(
+            "--policy must be a run for --delay, --jitter and --lost; add --stale for a LeRobot policy"
+        )
+    return DelayedActor(actor, max_delay=delay.longest)
 
 
 def load_policy(config: Config, folder: Path, instruction: str):

@@ -1,3 +1,6 @@
+from .delay import DelayFrames as DelayFrames
+from .delay import FrameDelay as FrameDelay
+from .delay_transform import DelayTransform as DelayTransform
 from .gym_env import DynmapEnv as DynmapEnv
 from .imagination import ImaginationEnv as ImaginationEnv
 from .imagination import make_start as make_start

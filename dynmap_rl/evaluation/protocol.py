@@ -5,6 +5,7 @@ from __future__ import annotations
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
+from dynmap_rl.envs.delay import FrameDelay
 from dynmap_rl.modules.actor import Actor
 from dynmap_rl.modules.world_model import WorldModel
 
@@ -16,7 +17,10 @@ FLAGS = "success", "dropped", "touched"
 
 
 def evaluate(
-    actor: TensorDictModuleBase, task: str, settings: Evaluation | None = None
+    actor: TensorDictModuleBase,
+    task: str,
+    settings: Evaluation | None = None,
+    delay: FrameDelay | None = None,
 ) -> dict[str, dict[str, dict]]:
     """Evaluate an actor in closed loop; all episodes run as one batch.
 
@@ -24,6 +28,7 @@ def evaluate(
         actor: see :func:`dynmap_rl.evaluation.roll_out`.
         task: name of the task.
         settings: scenes to evaluate on; default :class:`Evaluation`.
+        delay: delay of the frames; see :func:`dynmap_rl.evaluation.roll_out`.
 
     Returns:
         ``test`` on the shared start states and, if ``settings.paper_episodes`` is not 0, ``paper`` on others. Each has
@@ -32,7 +37,7 @@ def evaluate(
     settings = settings or Evaluation()
     seeds = scene_seeds(settings.split, settings.episodes)
     seeds += scene_seeds(settings.split, settings.paper_episodes, start=SHARED_STARTS)
-    rows = episode_rows(roll_out(actor, task, seeds), seeds)
+    rows = episode_rows(roll_out(actor, task, seeds, delay=delay), seeds)
     parts = {"test": rows[: settings.episodes], "paper": rows[settings.episodes :]}
     return {
         name: {"summary": summarize(part), "rows": pack_rows(part)} for name, part in parts.items() if part

@@ -7,12 +7,16 @@ from collections.abc import Sequence
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import Compose, RenameTransform, TransformedEnv
 from torchrl.envs.utils import step_mdp
 from tqdm import tqdm
 
+from dynmap_rl.envs.delay import FrameDelay
+from dynmap_rl.envs.delay_transform import DelayTransform
 from dynmap_rl.envs.scene import scene_seed
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.envs.world import EPISODE_STEPS
+from dynmap_rl.modules.delayed_actor import DelayedActor
 
 EVENTS = tuple(("next", key) for key in ("position_error", "dropped", "touched", "is_success"))
 
@@ -24,7 +28,11 @@ def scene_seeds(split: str, count: int, start: int = 0) -> list[int]:
 
 @torch.no_grad()
 def roll_out(
-    actor: TensorDictModuleBase, task: str, seeds: list[int], keep_pixels: bool = False
+    actor: TensorDictModuleBase,
+    task: str,
+    seeds: list[int],
+    keep_pixels: bool = False,
+    delay: FrameDelay | None = None,
 ) -> TensorDict:
     """Run one episode of 120 steps for each scene; an episode goes on after the block is dropped.
 
@@ -33,7 +41,9 @@ def roll_out(
             does.
         task: name of the task.
         seeds: seeds of the scenes.
-        keep_pixels: keep the frames in the result.
+        keep_pixels: keep the frames in the result, each at the step at which it was taken.
+        delay: delay of the frames, which are the same for the same scenes. A :class:`dynmap_rl.modules.DelayedActor`
+            gets every frame that arrives; any other actor gets the newest that has arrived.
 
     Returns:
         A TensorDict ``[E, 120]`` with ``action``, ``goal`` and ``dynamics`` at t, ``pixels`` if they are kept, and
@@ -45,8 +55,12 @@ def roll_out(
         actor.reset()
     device, count = next(actor.parameters()).device, len(seeds)
     env = DynmapBatchedEnv(task, count, from_pixels=True, include_state=False, device=device)
-    td = env.reset(TensorDict({"scene_seed": torch.tensor(seeds)}, [count]))
-    keys = ["action", "goal", *EVENTS, *(["pixels"] if keep_pixels else [])]
+    if delay:
+        late = DelayTransform(delay, seeds, bursts=isinstance(actor, DelayedActor))
+        env = TransformedEnv(env, Compose(RenameTransform(["pixels"], ["present"], create_copy=True), late))
+    td = env.reset(scene_seed=torch.tensor(seeds))
+    pixels = "present" if delay else "pixels"
+    keys = ["action", "goal", *EVENTS, *([pixels] if keep_pixels else [])]
     world_model = getattr(actor, "world_model", None)
     quantities = world_model.supervision if world_model else ()
     predicted = {quantity: torch.zeros(count, 6, device=device) for quantity in quantities}
@@ -59,7 +73,8 @@ def roll_out(
         td = step_mdp(td, keep_other=False)
         if quantities:
             predicted = world_model.decode_dynamics(td["predicted_latent"], td["hidden1"], td["hidden2"])
-    return torch.stack(steps, 1).cpu()
+    episodes = torch.stack(steps, 1).cpu()
+    return episodes.rename_key_(pixels, "pixels") if keep_pixels else episodes
 
 
 def episode_rows(episodes: TensorDict, seeds: list[int]) -> list[dict]:

@@ -11,6 +11,7 @@ from .checkpoints import save_world_model as save_world_model
 from .decoder import DynamicsDecoder as DynamicsDecoder
 from .decoder import PlainDecoder as PlainDecoder
 from .decoder import SpriteDecoder as SpriteDecoder
+from .delayed_actor import DelayedActor as DelayedActor
 from .encoder import GlimpseEncoder as GlimpseEncoder
 from .encoder import PlainEncoder as PlainEncoder
 from .normalization import Normalizer as Normalizer
@@ -18,5 +19,6 @@ from .policy import FeedforwardPolicy as FeedforwardPolicy
 from .policy import RecurrentPolicy as RecurrentPolicy
 from .precision import mixed_precision as mixed_precision
 from .recurrent import TwoLSTM as TwoLSTM
+from .robot_actor import RobotActor as RobotActor
 from .transition import Transition as Transition
 from .world_model import WorldModel as WorldModel

@@ -10,6 +10,7 @@ import torch
 from PIL import Image
 from tensordict.nn import TensorDictModuleBase
 
+from dynmap_rl.envs.delay import FrameDelay
 from dynmap_rl.envs.renderer import Renderer
 from dynmap_rl.envs.task import Task
 from dynmap_rl.evaluation.protocol import unpack_rows
@@ -57,7 +58,9 @@ def film(
     save_gif(torch.from_numpy(frames).permute(0, 1, 4, 2, 3), path)
 
 
-def film_policy(actor: TensorDictModuleBase, task: str, rows: dict, path: Path) -> None:
+def film_policy(
+    actor: TensorDictModuleBase, task: str, rows: dict, path: Path, delay: FrameDelay | None = None
+) -> None:
     """Write eight evaluated episodes as an animation, failures first.
 
     Args:
@@ -65,7 +68,8 @@ def film_policy(actor: TensorDictModuleBase, task: str, rows: dict, path: Path) 
         task: name of the task.
         rows: ``rows`` of the result of :func:`dynmap_rl.evaluation.evaluate`.
         path: file to write.
+        delay: delay of the frames in that evaluation.
     """
     rows = unpack_rows(rows)
     some = failures_first([row["scene_seed"] for row in rows], [row["success"] for row in rows])
-    save_gif(roll_out(actor, task, some, keep_pixels=True)["pixels"], path)
+    save_gif(roll_out(actor, task, some, True, delay)["pixels"], path)

@@ -1,0 +1,106 @@
+"""Late and lost frames: their settings, and a Gymnasium wrapper."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from dynmap_rl.utils.settings import check_at_least
+
+
+@dataclass(frozen=True)
+class FrameDelay:
+    """How frames arrive: the frame taken at step t arrives at step t + ``steps`` + j, or never.
+
+    The number j is drawn for each frame from ``-jitter`` to ``jitter``, so that frames overtake each other and arrive in
+    bursts. The first frame of an episode arrives at once, as a robot waits for it before it moves.
+    """
+
+    # Mean delay in control steps.
+    steps: int = 0
+    # Largest deviation from it, in control steps; at most `steps`.
+    jitter: int = 0
+    # Probability that a frame is lost.
+    lost: float = 0.0
+
+    def __post_init__(self):
+        check_at_least(self, 0, "steps", "jitter", "lost")
+        if self.jitter > self.steps:
+            raise ValueError(
+                f"FrameDelay.jitter must be at most the delay of {self.steps} steps, got {self.jitter}"
+            )
+        if self.lost > 1:
+            raise ValueError(f"FrameDelay.lost must be a probability, 0 to 1, got {self.lost}")
+
+    @property
+    def longest(self) -> int:
+        """Longest delay in control steps."""
+        return self.steps + self.jitter
+
+    def draw(self, generator: np.random.Generator) -> int | None:
+        """Draw the delay of a frame in control steps; None for a frame that is lost."""
+        lost = generator.random() < self.lost
+        delay = self.steps + int(generator.integers(-self.jitter, self.jitter, endpoint=True))
+        return None if lost else delay
+
+
+class DelayFrames(gym.Wrapper, gym.utils.RecordConstructorArgs):
+    """Wrapper that delays, jitters and drops the frames of a Gymnasium environment.
+
+    The observation has the newest frame that has arrived. ``info["delay"]`` is the number of steps since that frame was
+    taken. ``info["arrived"]`` has all frames that arrive in this step, by their delay; it is empty where none arrives.
+    ``reset(seed=...)`` determines the delays, too. Everything else, such as ``agent_pos``, is not delayed.
+
+    Args:
+        env: environment whose observations are frames, or dicts with a frame.
+        delay: how frames arrive.
+        key: name of the frame in a dict of observations.
+    """
+
+    def __init__(self, env: gym.Env, delay: FrameDelay, key: str = "pixels"):
+        gym.utils.RecordConstructorArgs.__init__(self, delay=delay, key=key)
+        gym.Wrapper.__init__(self, env)
+        self.delay, self.key = delay, key if isinstance(env.observation_space, gym.spaces.Dict) else None
+        self._generator = make_generator(None)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+        if seed is not None:
+            self._generator = make_generator(seed)
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._step, self._taken = 0, -1
+        self._due: dict[int, list[int]] = defaultdict(
+            list
+        )  # steps at which frames were taken, by that of arrival
+        self._frames: dict[int, np.ndarray] = {}
+        return self._deliver(observation, info, delay=0)
+
+    def step(self, action):
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._step += 1
+        observation, info = self._deliver(observation, info, self.delay.draw(self._generator))
+        return observation, reward, terminated, truncated, info
+
+    def _deliver(self, observation, info: dict, delay: int | None) -> tuple[Any, dict]:
+        """Send a new frame off, and return what arrives in this step."""
+        if delay is not None:
+            self._due[self._step + delay].append(self._step)
+            self._frames[self._step] = observation if self.key is None else observation[self.key]
+        arrived = {taken: self._frames.pop(taken) for taken in sorted(self._due.pop(self._step, ()))}
+        if arrived and max(arrived) > self._taken:
+            self._taken = max(arrived)
+            self._newest = arrived[self._taken]
+        info |= {
+            "delay": np.int64(self._step - self._taken),
+            "arrived": {self._step - taken: frame for taken, frame in arrived.items()},
+        }
+        newest = self._newest.copy()  # a caller may change what it gets
+        return newest if self.key is None else observation | {self.key: newest}, info
+
+
+def make_generator(seed: int | None, world: int = 0) -> np.random.Generator:
+    """Make the generator of the delays of one world, which differs from that of the scenes with the same seed."""
+    return np.random.default_rng(None if seed is None else [seed, world])

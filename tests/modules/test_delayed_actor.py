@@ -1,0 +1,251 @@
+"""Delayed actor: late, lost and disordered frames against frames in time."""
+
+import pytest
+import torch
+from small import CONSTANTS, make_model
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.envs import Compose, InitTracker, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from dynmap_rl.envs import torchrl_env
+from dynmap_rl.envs.delay import FrameDelay
+from dynmap_rl.envs.delay_transform import DelayTransform
+from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
+from dynmap_rl.modules.actor import MEMORY, Actor
+from dynmap_rl.modules.checkpoints import make_policy
+from dynmap_rl.modules.delayed_actor import DelayedActor
+
+T = 9
+CLOSE = {"rtol": 1e-4, "atol": 1e-5}
+GOAL = torch.tensor([[0.3, 0.6], [0.7, 0.2]])
+both_kinds = pytest.mark.parametrize("kind", ["feedforward", "recurrent"])
+
+
+def make_actor(kind="recurrent"):
+    model = make_model()
+    return Actor(model, make_policy(CONSTANTS, kind, model, width=20)).eval()
+
+
+def make_frames():
+    generator = torch.Generator().manual_seed(0)
+    return torch.randint(0, 256, (2, T, 3, 64, 64), dtype=torch.uint8, generator=generator)
+
+
+def run(actor, arrivals, actions=None):
+    """Return the steps of two episodes: ``arrivals`` has the entries of each, ``actions`` replace the policy's."""
+    memory, steps = TensorDict({}, [2]), []
+    for t, entries in enumerate(arrivals):
+        td = actor.act(actor.observe(memory.clone().update({"goal": GOAL, **entries})))
+        if actions is not None:
+            td["action"] = actions[:, t]
+        memory = actor.predict(td)["next"]
+        keys = ["action", "latent", "next", *(["hidden1", "hidden2"] if "history" in td.keys() else [])]
+        steps.append(td.select(*keys))
+    return torch.stack(steps, 1)
+
+
+def send(frames, schedule, places=None):
+    """Return the entries of each step: those of ``schedule[t]`` are the steps of the frames that arrive at t."""
+    places, arrivals = places or max(map(len, schedule)), []
+    for t, taken in enumerate(schedule):
+        delay = torch.full((2, places), -1)
+        pixels = torch.full((2, places, 3, 64, 64), 99, dtype=torch.uint8)
+        for place, s in enumerate(taken):
+            pixels[:, place], delay[:, place] = frames[:, s], t - s
+        arrivals.append({"pixels": pixels, "delay": delay})
+    return arrivals
+
+
+@both_kinds
+@pytest.mark.parametrize("max_delay", [0, 3])
+@torch.no_grad()
+def test_without_delay_it_is_exactly_the_actor(kind, max_delay):
+    actor, frames = make_actor(kind), make_frames()
+    in_time = [{"pixels": frames[:, t]} for t in range(T)]
+    expected, out = run(actor, in_time), run(DelayedActor(actor, max_delay=max_delay), in_time)
+    for key in ("action", "latent", ("next", "predicted_latent"), *(("next", key) for key in MEMORY)):
+        assert torch.equal(out[key], expected[key]), key
+    assert torch.equal(out["hidden2"][:, 1:], expected["next", "hidden2"][:, :-1])
+
+
+@both_kinds
+@torch.no_grad()
+def test_it_filters_up_to_the_last_frame_and_imagines_the_rest(kind):
+    """The definition, step by step: a fixed delay, each frame with its own action, the policy with its own memory."""
+    actor, frames, delay = make_actor(kind), make_frames(), 3
+    out = run(DelayedActor(actor, delay), [{"pixels": frames[:, max(t - delay, 0)]} for t in range(T)])
+    model, memory = actor.world_model, actor.policy.initial_state(2)
+    latent = model.encode(frames)
+    for t in range(T):
+        z, state = latent[:, 0], model.initial_state(2)
+        for s in range(t):
+            z, state = model.step(latent[:, s] if s <= t - delay else z, out["action"][:, s], state)
+        action, memory = actor.policy.step(z, state[0], state[2], GOAL, memory)
+        for key, value in {"latent": z, "hidden1": state[0], "hidden2": state[2], "action": action}.items():
+            torch.testing.assert_close(out[key][:, t], value, **CLOSE)
+
+
+@torch.no_grad()
+def test_with_a_perfect_world_model_delay_changes_nothing(monkeypatch):
+    """In a world that the model predicts without error, late and lost frames hold nothing new."""
+    actor, model = make_actor(), make_model()
+    monkeypatch.setattr(actor.world_model, "encode", lambda pixels, mixed: pixels[..., 0, 0, :16])
+
+    def live(actor, delays):
+        latent, state = torch.randn(2, 16, generator=torch.Generator().manual_seed(2)), model.initial_state(2)
+        memory, frames, actions = TensorDict({}, [2]), [], []
+        for t, delay in enumerate(delays):
+            frames.append(latent[:, None, None].expand(2, 3, 64, 16))
+            td = memory.set("goal", GOAL)
+            if delay is not None:
+                td["pixels"], td["delay"] = frames[t - delay], torch.full((2, 1), delay)
+            actions.append(actor(td)["action"])
+            latent, state = model.step(latent, td["action"], state)
+            memory = td["next"]
+        return torch.stack(actions, 1)
+
+    delayed = DelayedActor(actor, max_delay=4)
+    late = live(delayed, [0, 1, 2, 3, None, 4, 2, None, 4])
+    torch.testing.assert_close(late, live(actor, [0] * T), **CLOSE)
+
+
+SCHEDULES = {
+    "late": [[0], [], [1], [2], [3], [4], [5], [6], [7, 8]],
+    "bursts": [[0], [], [], [1, 2, 3], [], [], [4, 5, 6], [], [7, 8]],
+    "disorder": [[0], [], [2], [1], [], [5, 3], [6], [4], [8, 7]],
+    "twice": [[0], [0, 1], [1, 2], [3, 2], [4], [5, 3], [6], [7, 6], [8]],
+}
+
+
+@pytest.mark.parametrize("name", SCHEDULES)
+@torch.no_grad()
+def test_once_all_frames_have_arrived_their_way_does_not_matter(name):
+    actor, frames = make_actor(), make_frames()
+    actions = 0.01 * torch.randn(2, T, 3, generator=torch.Generator().manual_seed(1))
+    in_time = run(DelayedActor(actor, max_delay=4), send(frames, [[t] for t in range(T)]), actions)
+    out = run(DelayedActor(actor, max_delay=4), send(frames, SCHEDULES[name]), actions)
+    assert name == "twice" or not torch.allclose(out["latent"][:, 4], in_time["latent"][:, 4])
+    for key in ("latent", "hidden1", "hidden2"):
+        torch.testing.assert_close(out[key][:, -1], in_time[key][:, -1], **CLOSE)
+
+
+@torch.no_grad()
+def test_frames_that_are_too_late_or_of_another_episode_are_lost():
+    actor, frames = make_actor(), make_frames()
+    lost = run(DelayedActor(actor, max_delay=2), send(frames, [[0], [], [], [2], [], [4], [], [], []]))
+    entries = send(frames, [[0], [], [], [2], [1], [4], [], [], [5]])  # delays of 3
+    entries[1] = {"pixels": frames[:, 5], "delay": torch.full((2, 1), 2)}  # taken before the first step
+    assert torch.equal(run(DelayedActor(actor, max_delay=2), entries)["action"], lost["action"])
+    no_entries = send(frames, [[0], [], [], [2], [], [4], [], [], []])
+    no_entries[-3:] = [{}] * 3
+    assert torch.equal(run(DelayedActor(actor, max_delay=2), no_entries)["action"], lost["action"])
+
+
+@torch.no_grad()
+def test_a_world_alone_acts_as_in_a_batch():
+    actor, frames = DelayedActor(make_actor(), max_delay=4), make_frames()
+    arrivals = send(frames, SCHEDULES["disorder"])
+    late = send(frames, SCHEDULES["bursts"], places=2 + 1)
+    for entries, others in zip(arrivals, late, strict=True):  # the second world has delays of its own
+        pixels, delay = others["pixels"].clone(), others["delay"].clone()
+        pixels[0, :2], delay[0, :2], delay[0, 2] = entries["pixels"][0], entries["delay"][0], -1
+        entries.update(pixels=pixels, delay=delay)
+    together = run(actor, arrivals)["action"]
+    for world in range(2):
+        memory = TensorDict()  # without a batch axis
+        for t, entries in enumerate(arrivals):
+            td = memory.update({key: value[world] for key, value in entries.items()}).set("goal", GOAL[world])
+            memory = actor(td)["next"]
+            torch.testing.assert_close(td["action"], together[world, t], rtol=1e-3, atol=1e-5)
+
+
+@torch.no_grad()
+def test_history_is_cleared_where_an_episode_begins():
+    actor, frames = DelayedActor(make_actor(), max_delay=3), make_frames()
+    memory = run(actor, send(frames, [[0], [1], [], [2]]))[:, -1]["next"]
+    entries = {"goal": GOAL, "pixels": frames[:, 5], "delay": torch.zeros(2, 1, dtype=torch.int64)}
+    begins = torch.tensor([[True], [False]])
+    out, fresh = (actor(td.update(entries)) for td in (memory.set("is_init", begins), TensorDict({}, [2])))
+    for key in ("action", ("next", "hidden2"), ("next", "history", "latent"), ("next", "history", "step")):
+        assert torch.equal(out[key][0], fresh[key][0])
+        assert not torch.equal(out[key][1], fresh[key][1]), key
+
+
+DELAY = FrameDelay(3, 2, 0.2)
+
+
+def make_env(actor, delay=DELAY, bursts=True):
+    env = DynmapBatchedEnv(num_envs=2, from_pixels=True, include_state=False, seed=0)
+    transforms = DelayTransform(delay, seed=0, bursts=bursts), InitTracker(), actor.make_tensordict_primer()
+    return TransformedEnv(env, Compose(*transforms))
+
+
+@both_kinds
+@pytest.mark.parametrize("bursts", [True, False])
+@torch.no_grad()
+def test_rollouts_and_collectors(kind, bursts, monkeypatch):
+    monkeypatch.setattr(torchrl_env, "EPISODE_STEPS", 8)
+    actor = DelayedActor(make_actor(kind), max_delay=5)
+    env = make_env(actor, bursts=bursts)
+    check_env_specs(env)
+    out = env.rollout(8, actor)
+    memory = TensorDict({}, [2])
+    for t in range(8):  # as without a primer
+        td = actor(memory.update(out[:, t].select("pixels", "delay", "goal")))
+        torch.testing.assert_close(td["action"], out["action"][:, t], **CLOSE)
+        memory = td["next"]
+    collector = Collector(make_env(actor, bursts=bursts), actor, frames_per_batch=40, total_frames=40)
+    [batch] = list(collector)
+    collector.shutdown()
+    begins = batch["is_init"].squeeze(-1)
+    assert begins[:, 8].all() and (batch["history", "step"].squeeze(-1)[begins] == 0).all()
+    assert (batch["history", "arrived"][:, 8].sum((1, 2)) == 1).all()
+
+
+@torch.no_grad()
+def test_in_an_environment_without_delay_a_rollout_is_the_actor_s():
+    actor = make_actor()
+    delayed = DelayedActor(actor, max_delay=2)
+    plain = DynmapBatchedEnv(num_envs=2, from_pixels=True, include_state=False, seed=0)
+    plain = TransformedEnv(plain, Compose(InitTracker(), actor.make_tensordict_primer()))
+    expected = plain.rollout(10, actor)
+    out = make_env(delayed, FrameDelay()).rollout(10, delayed)
+    for key in ("action", "latent", ("next", "hidden1"), ("next", "policy_hidden2")):
+        assert torch.equal(out[key], expected[key])
+
+
+def test_keys_are_those_of_the_actor():
+    plain, frames = make_actor(), make_frames()
+    keys = {
+        "pixels": ("camera", "front"),
+        "action": ("agent", "move"),
+        "memory": tuple(("m", k) for k in MEMORY),
+    }
+    actor = Actor(plain.world_model, plain.policy, latent=("m", "z"), **keys)
+    actor = DelayedActor(actor, 2, delay_key=("camera", "delay"), history=("m", "history"))
+    td = TensorDict({("camera", "front"): frames[:, 0], "goal": GOAL}, [2])
+    td["camera", "delay"] = torch.zeros(2, 1, dtype=torch.int64)
+    out = actor(td)
+    expected = plain(TensorDict({"pixels": frames[:, 0], "goal": GOAL}, [2]))
+    assert torch.equal(out["agent", "move"], expected["action"])
+    assert set(actor.out_keys) <= set(out.keys(True, True))
+    assert {key for key in out["next"].keys(True, True) if "history" in key} == {
+        key for key in actor.make_tensordict_primer().primers.keys(True, True) if "history" in key
+    }
+
+
+@torch.no_grad()
+def test_gradients_pass_through_the_imagined_steps():
+    actor, frames = make_actor("feedforward"), make_frames()
+    with torch.enable_grad():
+        out = run(DelayedActor(actor, 3), [{"pixels": frames[:, max(t - 3, 0)]} for t in range(5)])
+        out["action"][:, -1].sum().backward()
+    assert actor.world_model.transition.change.weight.grad.abs().sum() > 0
+    assert all(p.grad.abs().sum() > 0 for p in actor.policy.parameters())
+
+
+@pytest.mark.parametrize("arguments", [(-1,), (3, 2)])
+def test_bad_delays_are_refused(arguments):
+    with pytest.raises(ValueError, match="delay must be between 0 and max_delay"):
+        DelayedActor(make_actor(), *arguments)

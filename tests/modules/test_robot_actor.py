@@ -1,0 +1,113 @@
+"""Actor on a robot's clock against the delayed actor, whose delays count steps."""
+
+import numpy as np
+import pytest
+import torch
+from small import CONSTANTS, make_model
+from tensordict import TensorDict
+
+from dynmap_rl.modules.actor import Actor
+from dynmap_rl.modules.checkpoints import make_policy
+from dynmap_rl.modules.delayed_actor import DelayedActor
+from dynmap_rl.modules.robot_actor import RobotActor
+
+GOAL = np.array([0.3, 0.6])
+FRAMES = np.random.default_rng(0).integers(0, 256, (12, 64, 64, 3), np.uint8)
+DT = 0.05
+
+
+def make_actor(max_delay=4):
+    model = make_model()
+    return DelayedActor(
+        Actor(model, make_policy(CONSTANTS, "recurrent", model, width=20)), max_delay=max_delay
+    )
+
+
+def make_robot(**arguments):
+    robot = RobotActor(make_actor(), **arguments)
+    robot.reset(GOAL)
+    return robot
+
+
+@torch.no_grad()
+def run_in_steps(schedule):
+    """Return the actions where ``schedule[t]`` are the steps of the frames that arrive at t."""
+    actor, memory, actions = make_actor().eval(), TensorDict(), []
+    for t, taken in enumerate(schedule):
+        td = memory.set("goal", torch.as_tensor(GOAL, dtype=torch.float32))
+        if taken:
+            td["pixels"] = torch.from_numpy(FRAMES[taken]).movedim(-1, -3)
+            td["delay"] = torch.tensor([t - s for s in taken])
+        actions.append(actor(td)["action"].numpy())
+        memory = td["next"]
+    return np.stack(actions)
+
+
+SCHEDULE = [[0], [], [], [2, 1], [], [5], [3], [], [6, 8]]
+
+
+@pytest.mark.parametrize("unit", [1, 1000])
+def test_timestamps_become_steps(unit):
+    """Frames and calls are up to 10 ms off the beat, and the clock does not begin at 0."""
+    robot, noise, actions = make_robot(period=DT * unit), np.random.default_rng(1), []
+    start, shift = 1234.5 * unit, 0.01 * unit
+    for t, taken in enumerate(SCHEDULE):
+        for s in taken:
+            robot.observe(FRAMES[s], start + s * DT * unit + noise.uniform(-shift, shift))
+        actions.append(robot.act(start + t * DT * unit + noise.uniform(-shift, shift)))
+    assert actions[0].shape == (3,) and actions[0].dtype == np.float32
+    np.testing.assert_array_equal(actions, run_in_steps(SCHEDULE))
+
+
+def test_the_episode_begins_with_the_first_action():
+    """The robot is at rest before: its newest frame is as good as a new one, and older ones hold nothing new."""
+    robot = make_robot()
+    robot.observe(FRAMES[0], 9.7)
+    robot.observe(FRAMES[7], 9.5)
+    actions = [robot.act(10.0)]
+    robot.observe(FRAMES[8], 9.9)
+    robot.observe(FRAMES[1], 10.05)
+    actions.append(robot.act(10.05))
+    np.testing.assert_array_equal(actions, run_in_steps([[0], [1]]))
+
+
+def test_frames_that_are_too_old_are_not_used():
+    robot = make_robot()
+    robot.observe(FRAMES[0], 0.0)
+    actions = [robot.act(t * DT) for t in range(6)]
+    robot.observe(FRAMES[1], 1 * DT)  # 5 steps before the next action
+    actions.append(robot.act(6 * DT))
+    np.testing.assert_array_equal(actions, run_in_steps([[0], *[[]] * 6]))
+
+
+@torch.no_grad()
+def test_missed_steps_have_no_action():
+    robot = make_robot()
+    robot.observe(FRAMES[0], 0.0)
+    robot.act(0.0)
+    robot.observe(FRAMES[2], 0.1)
+    action = robot.act(0.15)
+
+    actor, goal = make_actor().eval(), torch.as_tensor(GOAL, dtype=torch.float32)
+    first = actor(TensorDict({"goal": goal, "pixels": torch.from_numpy(FRAMES[0]).movedim(-1, 0)}))["next"]
+    memory = first.clone()
+    for _ in range(2):
+        td = actor.predict(actor.observe(memory.clone()).set("action", torch.zeros(3)))
+        memory = td["next"].update(first.select(*actor.actor.latent_actor.policy_memory))
+    pixels = torch.from_numpy(FRAMES[2]).movedim(-1, 0)
+    td = actor(memory.update({"goal": goal, "pixels": pixels, "delay": torch.tensor([1])}))
+    np.testing.assert_array_equal(action, td["action"].numpy())
+
+
+def test_reset_forgets_the_episode_and_takes_a_goal():
+    robot = make_robot()
+    actions = []
+    for goal in (GOAL, GOAL, GOAL + 0.2):
+        robot.reset(goal)
+        robot.observe(FRAMES[0], 1.0)
+        actions.append([robot.act(1.0), robot.act(1.05)])
+    np.testing.assert_array_equal(actions[0], actions[1])
+    assert not np.allclose(actions[0], actions[2])
+    robot.reset(GOAL)
+    with pytest.raises(ValueError, match="call observe before act"):
+        robot.act(2.0)
