@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from dynmap_rl.envs.delay import FrameDelay
+from dynmap_rl.envs.renderer import Renderer
 from dynmap_rl.envs.tasks import TASKS, get_task
 from dynmap_rl.envs.world import EPISODE_STEPS
 from dynmap_rl.evaluation.protocol import evaluate, judge_in_closed_loop, pack_rows, unpack_rows
@@ -11,6 +13,7 @@ from dynmap_rl.evaluation.rollout import episode_rows, failures_first, roll_out,
 from dynmap_rl.evaluation.settings import Evaluation
 from dynmap_rl.modules.actor import Actor
 from dynmap_rl.modules.checkpoints import make_policy, make_world_model
+from dynmap_rl.modules.delayed_actor import DelayedActor
 
 CONSTANTS = {
     "action": {"low": [-0.02, -0.02, -0.05], "high": [0.02, 0.02, 0.05]},
@@ -37,6 +40,34 @@ def test_an_episode_does_not_depend_on_the_others_in_its_batch():
     together, alone = (roll_out(make_actor(), "balance_reaching", some) for some in (seeds, seeds[1:]))
     torch.testing.assert_close(together["action"][1], alone["action"][0], rtol=1e-3, atol=1e-5)
     assert together.shape == (2, EPISODE_STEPS)
+
+
+@pytest.mark.parametrize("make", [lambda: DelayedActor(make_actor(), max_delay=5), make_actor])
+def test_delays_belong_to_the_scene(make):
+    seeds, delay = scene_seeds("validation", 2), FrameDelay(3, 2, 0.2)
+    together, alone = (
+        roll_out(make(), "balance_reaching", some, keep_pixels=True, delay=delay)
+        for some in (seeds, seeds[1:])
+    )
+    torch.testing.assert_close(together["action"][1], alone["action"][0], rtol=1e-3, atol=1e-5)
+    task = get_task("balance_reaching")
+    world = task.make_world(task.sample_scene(np.random.default_rng(seeds[1])))
+    for t, action in enumerate(alone["action"][0, :20].numpy()):  # frames of the present are kept
+        frame = torch.from_numpy(Renderer().draw(world, task)).permute(2, 0, 1)
+        assert torch.equal(alone["pixels"][0, t], frame)
+        world.step(action)
+
+
+def test_without_delay_all_actors_and_their_predictions_are_the_same():
+    arguments = "balance_reaching", scene_seeds("validation", 2)
+    expected = roll_out(make_actor(), *arguments)
+    for actor, delay in (
+        (DelayedActor(make_actor(), max_delay=1), FrameDelay()),
+        (make_actor(), FrameDelay()),
+    ):
+        out = roll_out(actor, *arguments, delay=delay)
+        for key in ("action", ("predicted_dynamics", "position"), ("next", "position_error")):
+            assert torch.equal(out[key], expected[key])
 
 
 def test_rows_say_what_happened(rolled):

@@ -94,6 +94,23 @@ def test_the_shipped_policy_does_as_well_as_its_results_say(tmp_path):
     assert ours["rows"]["success"] == facts["rows"]["success"][:4]
 
 
+def test_late_frames_bridged_or_stale(tmp_path, monkeypatch):
+    monkeypatch.setattr("dynmap_rl.reporting.media.film_policy", lambda *arguments: None)
+    rows = {}
+    for mode in ([], ["--stale"]):
+        late = "--delay", "6", "--jitter", "2", "--lost", "0.1", *mode
+        result = run(tmp_path, "evaluate", "--policy", "balance_reaching", "--eval.episodes", "2", *late)
+        assert result.returncode == 0, result.stderr
+        name = "_".join(
+            ["balance_reaching_balance_reaching_seed_0_delay_6_2_0.1", *(["stale"] if mode else []), "test"]
+        )
+        result = read_json(tmp_path / "runs/evaluate" / name / "eval.json")
+        assert result["delay"] == {"steps": 6, "jitter": 2, "lost": 0.1} and result["stale"] is bool(mode)
+        rows[bool(mode)] = result["rows"]
+    assert rows[False]["first_scene_seed"] == rows[True]["first_scene_seed"]
+    assert rows[False]["position_error"] != rows[True]["position_error"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -107,6 +124,11 @@ def test_the_shipped_policy_does_as_well_as_its_results_say(tmp_path):
         (["--eval.episodes", "0"], "episodes"),
         (["--eval.paper_episodes", "5"], "--eval.paper_episodes"),
         (["--eval.split", "holiday"], "holiday"),
+        (["--delay", "6"], "--delay has no effect with an expert"),
+        (["--policy", "balance_reaching", "--stale"], "--stale"),
+        (["--policy", "balance_reaching", "--delay", "-1"], "steps must be at least 0"),
+        (["--policy", "balance_reaching", "--jitter", "2"], "jitter must be at most the delay"),
+        (["--policy", "balance_reaching", "--lost", "2"], "lost must be a probability"),
     ],
 )
 def test_bad_input_gets_one_clear_line(tmp_path, arguments, message):
