@@ -14,7 +14,7 @@ runs/evaluate gets the numbers and a page with some of the episodes, failures fi
 """
 
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 
 from dynmap_rl.evaluation.settings import Evaluation
@@ -32,8 +32,7 @@ class Config:
     trust_remote_code: bool = False
     # Seed of the run's policy.
     seed: int = 0
-    # Task: balance_reaching, balance_reaching_obstacle, bin_dropping, or module:Class of your own; by default that of
-    # the run, otherwise balance_reaching.
+    # Task: balance_reaching, ..., or module:Class of your own; by default that of the run, else balance_reaching.
     task: str | None = None
     # Delay of the frames in control steps of 50 ms. The world model imagines the steps up to the present.
     delay: int = 0
@@ -41,6 +40,8 @@ class Config:
     jitter: int = 0
     # Probability that a frame is lost.
     lost: float = 0.0
+    # Error of the delays that the policy is told, in control steps.
+    delay_error: int = 0
     # Act on the newest frame that has arrived as if it were of the present, for comparison.
     stale: bool = False
     # Expert: the task that a shipped expert belongs to, a folder of checkpoints, or careless, a baseline that ignores the
@@ -69,7 +70,7 @@ def main(config: Config) -> None:
     if config.policy:
         refuse(config, Config(), ["expert", "checkpoint"], "--policy")
     else:
-        names = ["seed", "trust_remote_code", "delay", "jitter", "lost", "stale"]
+        names = ["seed", "trust_remote_code", "delay", "jitter", "lost", "delay_error", "stale"]
         refuse(config, Config(), names, "an expert")
     torch.set_num_threads(config.compute.threads)
     folder, text, result = (judge_policy if config.policy else judge_expert)(config)
@@ -109,7 +110,7 @@ def judge_policy(config: Config) -> tuple[Path, str, dict]:
     text = f"DR {summary['DR']:.1f} %   PE {summary['PE']:.1f} mm   SR {summary['SR']:.1f} % [{low:.1f}, {high:.1f}]"
     parts = [*Path(config.policy).parts[-4:], f"seed_{config.seed}"]
     if delay:
-        parts += [f"delay_{delay.steps}_{delay.jitter}_{delay.lost}", *(["stale"] if config.stale else [])]
+        parts += ["_".join(map(str, ["delay", *astuple(delay)])), *(["stale"] if config.stale else [])]
         result |= {"delay": asdict(delay), "stale": config.stale}
     folder = name_folder(config, get_task(task).name, *parts)
     film_policy(actor, task, result["rows"], folder / "rollouts.gif", delay)
@@ -120,7 +121,7 @@ def read_delay(config: Config):
     """Return the delay of the frames, or None without one."""
     from dynmap_rl.envs.delay import FrameDelay
 
-    delay = FrameDelay(config.delay, config.jitter, config.lost)
+    delay = FrameDelay(config.delay, config.jitter, config.lost, config.delay_error)
     if delay == FrameDelay():
         refuse(config, Config(), ["stale"], "frames in time")
         return None
@@ -133,9 +134,7 @@ def imagine_present(actor, delay):
     from dynmap_rl.modules.delayed_actor import DelayedActor
 
     if not isinstance(actor, Actor):
-        raise ValueError(
-            "--policy must be a run for --delay, --jitter and --lost; add --stale for a LeRobot policy"
-        )
+        raise ValueError("--policy must be a run for --delay; add --stale for a LeRobot policy")
     return DelayedActor(actor, max_delay=delay.longest)
 
 
@@ -167,6 +166,7 @@ def load_policy(config: Config, folder: Path, instruction: str):
 def judge_expert(config: Config) -> tuple[Path, str, dict]:
     """Return the folder with an animation, the numbers as text, and the result: ``rates`` and ``intervals`` (%)."""
     from dynmap_rl.envs.tasks import get_task
+    from dynmap_rl.evaluation.experts import list_outcomes
     from dynmap_rl.evaluation.rollout import failures_first, scene_seeds
     from dynmap_rl.evaluation.statistics import wilson
     from dynmap_rl.experts.careless import CarelessController
@@ -193,22 +193,6 @@ def judge_expert(config: Config) -> tuple[Path, str, dict]:
     film(network, task, some, folder / "rollouts.gif", states=trained_on)
     result = {"task": config.task or task.name, "expert": expert, "checkpoint": checkpoint}
     return folder, "\n".join(lines), result | {"rates": rates, "intervals": intervals}
-
-
-def list_outcomes(task, worlds: list) -> dict[str, list[bool]]:
-    """Return for every outcome whether each of the worlds has it at the end of its episode."""
-    from dynmap_rl.envs.geometry import path_is_blocked, way_from_start
-    from dynmap_rl.envs.scene import ObstacleScene
-
-    outcomes = {
-        "success": [task.is_success(world) for world in worlds],
-        "dropped": [world.dropped for world in worlds],
-        "touched": [bool(world.touched) for world in worlds],
-    }
-    if issubclass(task.ranges.scene, ObstacleScene):
-        outcomes["straight_path_blocked"] = [path_is_blocked(world.scene) for world in worlds]
-        outcomes["way_leads_around"] = [len(way_from_start(world.scene)) > 2 for world in worlds]
-    return outcomes
 
 
 if __name__ == "__main__":

@@ -17,7 +17,8 @@ class FrameDelay:
     """How frames arrive: the frame taken at step t arrives at step t + ``steps`` + j, or never.
 
     The number j is drawn for each frame from ``-jitter`` to ``jitter``, so that frames overtake each other and arrive in
-    bursts. The first frame of an episode arrives at once, as a robot waits for it before it moves.
+    bursts. The first frame of an episode arrives at once, as a robot waits for it before it moves. Frames are
+    reported to be ``error`` steps older than they are, as by a wrong clock; the first frame is not.
     """
 
     # Mean delay in control steps.
@@ -26,6 +27,8 @@ class FrameDelay:
     jitter: int = 0
     # Probability that a frame is lost.
     lost: float = 0.0
+    # Error of the reported delays, in control steps; not of the first frame's.
+    error: int = 0
 
     def __post_init__(self):
         check_at_least(self, 0, "steps", "jitter", "lost")
@@ -33,13 +36,18 @@ class FrameDelay:
             raise ValueError(
                 f"FrameDelay.jitter must be at most the delay of {self.steps} steps, got {self.jitter}"
             )
+        if self.steps - self.jitter + self.error < 0:
+            raise ValueError(
+                f"FrameDelay.error must be at least {self.jitter - self.steps}, so that no reported delay is negative, "
+                f"got {self.error}"
+            )
         if self.lost > 1:
             raise ValueError(f"FrameDelay.lost must be a probability, 0 to 1, got {self.lost}")
 
     @property
     def longest(self) -> int:
-        """Longest delay in control steps."""
-        return self.steps + self.jitter
+        """Longest delay in control steps, true or reported."""
+        return self.steps + self.jitter + max(self.error, 0)
 
     def draw(self, generator: np.random.Generator) -> int | None:
         """Draw the delay of a frame in control steps; None for a frame that is lost."""
@@ -94,11 +102,15 @@ class DelayFrames(gym.Wrapper, gym.utils.RecordConstructorArgs):
             self._taken = max(arrived)
             self._newest = arrived[self._taken]
         info |= {
-            "delay": np.int64(self._step - self._taken),
-            "arrived": {self._step - taken: frame for taken, frame in arrived.items()},
+            "delay": np.int64(self._report(self._taken)),
+            "arrived": {self._report(taken): frame for taken, frame in arrived.items()},
         }
         newest = self._newest.copy()  # a caller may change what it gets
         return newest if self.key is None else observation | {self.key: newest}, info
+
+    def _report(self, taken: int) -> int:
+        """Return the reported delay of a frame by the step at which it was taken."""
+        return self._step - taken + (self.delay.error if taken else 0)
 
 
 def make_generator(seed: int | None, world: int = 0) -> np.random.Generator:

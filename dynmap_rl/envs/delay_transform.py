@@ -52,6 +52,7 @@ class DelayTransform(Transform):
         self._frames = pixels.new_zeros(length, *pixels.shape)
         self._arrival = torch.full((length, count), NEVER, device=device)
         self._newest, self._taken = pixels.clone(), torch.full((count,), NEVER, device=device)
+        self._began = torch.zeros(count, dtype=torch.int64, device=device)  # step of the first frame
         if self.seed is None or isinstance(self.seed, int):
             self._generators = [make_generator(self.seed, world) for world in range(count)]
         else:
@@ -67,7 +68,7 @@ class DelayTransform(Transform):
             self._start(pixels)
         mask = tensordict.get("_reset", torch.ones(len(pixels), dtype=torch.bool)).flatten()
         slot = self._now % len(self._frames)
-        self._arrival[:, mask], self._taken[mask] = NEVER, NEVER
+        self._arrival[:, mask], self._taken[mask], self._began[mask] = NEVER, NEVER, self._now
         self._arrival[slot, mask], self._frames[slot, mask] = self._now, pixels[mask]
         # TorchRL keeps the old entries of the worlds that are not reset.
         return self._deliver(tensordict_reset)
@@ -101,6 +102,8 @@ class DelayTransform(Transform):
             worlds, frames = worlds[newer], frames[newer]
             self._newest[worlds], self._taken[worlds] = frames, self._now - delay[worlds, 0]
             pixels, delay = self._newest.clone(), (self._now - self._taken)[:, None]
+        wrong = (delay >= 0) & (self._now - delay != self._began[:, None])
+        delay = delay + self.delay.error * wrong
         tensordict.set(self.out_keys[0], pixels.reshape(*batch, *pixels.shape[1:]))
         return tensordict.set(self.out_keys[1], delay.reshape(*batch, self.places))
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from dynmap_rl.envs.scene import scene_seed
+from dynmap_rl.envs.geometry import path_is_blocked, way_from_start
+from dynmap_rl.envs.scene import ObstacleScene, scene_seed
 from dynmap_rl.envs.task import Task
 from dynmap_rl.envs.world import World
 
@@ -33,6 +34,24 @@ def rates_text(row: dict) -> str:
     error = f"position error {1000 * row['position_error']:.0f} mm"
     rate = f"success {100 * row['success']:.1f} % [{low:.1f}, {high:.1f}]   drop {100 * row['drop']:.1f} %"
     return f"{rate}   {error}   ({row['episodes']} scenes)"
+
+
+def list_outcomes(task: Task, worlds: list[World]) -> dict[str, list[bool]]:
+    """Return for every outcome whether each of the worlds has it at the end of its episode.
+
+    Args:
+        task: defines success. Tasks with an obstacle also have ``straight_path_blocked`` and ``way_leads_around``.
+        worlds: worlds at the end of their episodes.
+    """
+    outcomes = {
+        "success": [task.is_success(world) for world in worlds],
+        "dropped": [world.dropped for world in worlds],
+        "touched": [bool(world.touched) for world in worlds],
+    }
+    if issubclass(task.ranges.scene, ObstacleScene):
+        outcomes["straight_path_blocked"] = [path_is_blocked(world.scene) for world in worlds]
+        outcomes["way_leads_around"] = [len(way_from_start(world.scene)) > 2 for world in worlds]
+    return outcomes
 
 
 def fresh_scenes(count: int) -> list[int]:

@@ -76,6 +76,17 @@ def test_a_constant_delay_and_none():
     assert [row[1] for row in play(FrameDelay(4))] == [0, 1, 2, 3] + [4] * (STEPS - 3)
 
 
+@pytest.mark.parametrize("error", [-3, 2])
+def test_a_wrong_clock_changes_the_reported_delays_alone(error):
+    right, wrong = play(FrameDelay(4, 1, 0.2), seed=5), play(FrameDelay(4, 1, 0.2, error), seed=5)
+    for t, ((frame, age, arrived), (same, reported, elsewhere)) in enumerate(zip(right, wrong, strict=True)):
+        assert frame == same and list(arrived.values()) == list(elsewhere.values())
+        assert reported == age + (error if age < t else 0)
+        assert list(elsewhere) == [age + (error if age < t else 0) for age in arrived]
+    with pytest.raises(ValueError, match="error must be at least -3"):
+        FrameDelay(4, 1, error=-4)
+
+
 def test_rates_are_those_of_the_settings():
     generator, delay = make_generator(0), FrameDelay(6, 2, 0.1)
     draws = [delay.draw(generator) for _ in range(5000)]

@@ -1,5 +1,7 @@
 """Late frames in TorchRL: specs, rollouts, resets, and the same delays as in Gymnasium."""
 
+from dataclasses import replace
+
 import gymnasium as gym
 import pytest
 import torch
@@ -64,11 +66,13 @@ def test_frames_are_those_of_the_steps_that_the_delays_name():
             assert torch.equal(newest["pixels"][world, t], on_time[world, last])
 
 
-def test_delays_equal_those_of_the_gymnasium_wrapper():
-    late = play(make_env(seed=SEEDS.tolist()))
+@pytest.mark.parametrize("error", [0, 3])
+def test_delays_equal_those_of_the_gymnasium_wrapper(error):
+    delay = replace(DELAY, error=error)
+    late = play(make_env(delay, seed=SEEDS.tolist()))
     for world, seed in enumerate(SEEDS.tolist()):
         env = gym.make("dynmap_rl/BalanceReaching-v1", obs_type="pixels", disable_env_checker=True)
-        env = DelayFrames(env, DELAY)
+        env = DelayFrames(env, delay)
         frame, info = env.reset(seed=seed)
         for t, action in enumerate(make_actions(20)[world]):
             assert info["delay"] == late["delay"][world, t].item()

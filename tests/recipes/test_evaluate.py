@@ -102,10 +102,12 @@ def test_late_frames_bridged_or_stale(tmp_path, monkeypatch):
         result = run(tmp_path, "evaluate", "--policy", "balance_reaching", "--eval.episodes", "2", *late)
         assert result.returncode == 0, result.stderr
         name = "_".join(
-            ["balance_reaching_balance_reaching_seed_0_delay_6_2_0.1", *(["stale"] if mode else []), "test"]
+            ["balance_reaching_balance_reaching_seed_0_delay_6_2_0.1_0", *(["stale"] if mode else []), "test"]
         )
         result = read_json(tmp_path / "runs/evaluate" / name / "eval.json")
-        assert result["delay"] == {"steps": 6, "jitter": 2, "lost": 0.1} and result["stale"] is bool(mode)
+        assert result["delay"] == {"steps": 6, "jitter": 2, "lost": 0.1, "error": 0} and result[
+            "stale"
+        ] is bool(mode)
         rows[bool(mode)] = result["rows"]
     assert rows[False]["first_scene_seed"] == rows[True]["first_scene_seed"]
     assert rows[False]["position_error"] != rows[True]["position_error"]
@@ -128,6 +130,10 @@ def test_late_frames_bridged_or_stale(tmp_path, monkeypatch):
         (["--policy", "balance_reaching", "--stale"], "--stale"),
         (["--policy", "balance_reaching", "--delay", "-1"], "steps must be at least 0"),
         (["--policy", "balance_reaching", "--jitter", "2"], "jitter must be at most the delay"),
+        (
+            ["--policy", "balance_reaching", "--delay", "2", "--delay_error", "-3"],
+            "error must be at least -2",
+        ),
         (["--policy", "balance_reaching", "--lost", "2"], "lost must be a probability"),
     ],
 )
