@@ -8,6 +8,7 @@ from .checkpoints import make_policy as make_policy
 from .checkpoints import make_world_model as make_world_model
 from .checkpoints import save_policy as save_policy
 from .checkpoints import save_world_model as save_world_model
+from .chunk_actor import ChunkActor as ChunkActor
 from .decoder import DynamicsDecoder as DynamicsDecoder
 from .decoder import PlainDecoder as PlainDecoder
 from .decoder import SpriteDecoder as SpriteDecoder

@@ -94,3 +94,21 @@ def test_seeds_count_within_the_test_split():
 def test_env_config_refuses_other_values(field, value):
     with pytest.raises(ValueError, match=str(value)):
         DynmapEnvConfig(**{field: value})
+
+
+def test_late_frames():
+    config = make_env_config("dynmap", delay=2)
+    env = make_env(config, n_envs=2)["dynmap"][0]
+    on_time = make_env(make_env_config("dynmap"), n_envs=2)["dynmap"][0]
+    actions = 0.005 * torch.rand(120, 2, 3, generator=torch.Generator().manual_seed(0))
+    frames = []
+    for each in (env, on_time):
+        policy = Replay(actions)
+        rollout(each, policy, *config.get_env_processors(), identity, identity, seeds=[0, 1])
+        frames.append([seen["observation.images.front"] for seen in policy.seen])
+        each.close()
+    late, present = frames
+    assert all(torch.equal(late[t], present[max(t - 2, 0)]) for t in range(10))
+    assert not torch.equal(late[9], present[9])
+    with pytest.raises(ValueError, match="jitter"):
+        DynmapEnvConfig(delay=1, jitter=2)

@@ -14,6 +14,8 @@ from dynmap_rl.data.demonstrations import load_dataset, load_meta
 from dynmap_rl.integrations.lerobot.configuration_dynmap import DynmapConfig
 from dynmap_rl.integrations.lerobot.modeling_dynmap import DynmapPolicy
 from dynmap_rl.modules.actor import Actor
+from dynmap_rl.modules.chunk_actor import ChunkActor
+from dynmap_rl.modules.delayed_actor import DelayedActor
 from dynmap_rl.utils.weights import fingerprint
 
 SMALL = {"device": "cpu", "push_to_hub": False, "window_steps": 6, "rgb_frames": 2}
@@ -126,12 +128,43 @@ def test_actions_are_the_actors_step_by_step_and_again_after_a_reset(recording, 
     assert torch.equal(act(), torch.stack(expected, 1))
 
 
+@pytest.mark.parametrize("kind", ["recurrent", "feedforward"])
+@torch.no_grad()
+def test_late_frames_and_chunks(recording, kind, tmp_path):
+    new_policy(recording, kind=kind, delay=2, chunk_size=6).save_pretrained(tmp_path)
+    policy = DynmapPolicy.from_pretrained(tmp_path, strict=True)
+    episode = load_dataset(recording)[:2, :6]
+    actor = Actor(policy.world_model, policy.policy, mixed=True).eval()
+
+    def frames(t, *step):
+        numbers = torch.tensor(step).float().expand(2, -1)
+        state = torch.cat([numbers, episode["agent_pos"][:, t]], 1)
+        return {"observation.images.front": episode["pixels"][:, t] / 255, "observation.state": state}
+
+    delayed, memory = DelayedActor(actor, delay=2), TensorDict({}, [2])
+    for t in range(6):
+        td = delayed(episode[:, max(t - 2, 0)].select("pixels", "goal").update(memory))
+        memory = td["next"]
+        assert torch.equal(policy.select_action(frames(max(t - 2, 0))), td["action"])
+
+    chunks = ChunkActor(actor, 6, delay=2)
+    for t in (0, 3, 5):
+        expected = chunks.act(episode["pixels"][:, t], episode["goal"][:, t], t)
+        assert torch.equal(policy.predict_action_chunk(frames(t, t)), expected)
+    policy.reset(), chunks.reset()
+    for t in (0, 1):  # without the number of the step
+        expected = chunks.act(episode["pixels"][:, t], episode["goal"][:, t])
+        assert torch.equal(policy.predict_action_chunk(frames(t)), expected)
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({"supervision": "speed"}, "speed"),
         ({"kind": "transformer"}, "transformer"),
         ({"window_steps": 1}, "window_steps"),
+        ({"delay": 20}, "delay"),
+        ({"delay": -1}, "delay"),
     ],
 )
 def test_wrong_settings_are_refused(settings, message):

@@ -39,13 +39,17 @@ class DynmapConfig(PreTrainedConfig):
         distractors: largest number of bars of a window.
         symmetric: mirror and shift training windows. By default, true where the dataset's task is symmetric.
         mixed: train, and encode frames in control, in bfloat16 where the processor supports it.
+        delay: age of a frame, in control steps, when the action that it leads to is executed. In ``select_action``, every
+            frame is this old. In ``predict_action_chunk``, it is the time from a frame to the arrival of its chunk.
+        chunk_size: actions that ``predict_action_chunk`` returns.
         optimizer_lr: learning rate of AdamW.
         optimizer_weight_decay: weight decay of AdamW.
         task: task of the dataset; written by training.
         source: origin of the world model (see :func:`dynmap_rl.runs.load_source`); written by training.
 
     Raises:
-        ValueError: supervision or kind is unknown, or windows have less than two steps.
+        ValueError: supervision or kind is unknown, windows have less than two steps, or ``delay`` is not below
+            ``chunk_size``.
     """
 
     supervision: str = "position,velocity"
@@ -65,6 +69,8 @@ class DynmapConfig(PreTrainedConfig):
     distractors: int = 3
     symmetric: bool | None = None
     mixed: bool = True
+    delay: int = 0
+    chunk_size: int = 20
     optimizer_lr: float = 2e-3
     optimizer_weight_decay: float = 1e-4
     task: str | None = None
@@ -80,6 +86,10 @@ class DynmapConfig(PreTrainedConfig):
         check_policy(self.kind)
         if self.window_steps < 2:
             raise ValueError(f"--policy.window_steps must be at least 2, got {self.window_steps}")
+        if not 0 <= self.delay < self.chunk_size:
+            raise ValueError(
+                f"--policy.delay must be at least 0 and below --policy.chunk_size, got {self.delay} and {self.chunk_size}"
+            )
 
     @property
     def camera(self) -> str:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from functools import partial
 
 import gymnasium as gym
+import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
@@ -14,6 +15,7 @@ from lerobot.processor import PolicyProcessorPipeline, RenameObservationsProcess
 from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 
 from dynmap_rl.data.format.writing import FPS
+from dynmap_rl.envs.delay import DelayFrames, FrameDelay
 from dynmap_rl.envs.scene import scene_seed
 from dynmap_rl.envs.world import EPISODE_STEPS
 from dynmap_rl.keys import CAMERA, FRAME_SHAPE, GYMNASIUM_IDS
@@ -32,9 +34,12 @@ class DynmapEnvConfig(EnvConfig):
             demonstrations: ``test`` with 0 to 999 are the start states of the tables, ``validation`` is for choosing
             settings.
         render_size: side of the frames of a video, in pixels; an even number.
+        delay: delay of the frames, in control steps (see :class:`dynmap_rl.envs.FrameDelay`, also for the next two).
+        jitter: largest deviation from it.
+        lost: probability that a frame is lost.
 
     Raises:
-        ValueError: task or split is unknown, or length or rate differ.
+        ValueError: task or split is unknown, length or rate differ, or delays are impossible.
     """
 
     task: str | None = "balance_reaching"
@@ -42,6 +47,9 @@ class DynmapEnvConfig(EnvConfig):
     episode_length: int = EPISODE_STEPS
     split: str = "test"
     render_size: int = 256
+    delay: int = 0
+    jitter: int = 0
+    lost: float = 0.0
     features: dict[str, PolicyFeature] = field(
         default_factory=lambda: {
             ACTION: PolicyFeature(FeatureType.ACTION, (3,)),
@@ -57,6 +65,7 @@ class DynmapEnvConfig(EnvConfig):
         if self.task not in GYMNASIUM_IDS:
             raise ValueError(f"--env.task must be one of {', '.join(GYMNASIUM_IDS)}, got {self.task!r}")
         scene_seed(self.split, 0)
+        FrameDelay(self.delay, self.jitter, self.lost)
         if (self.fps, self.episode_length) != (FPS, EPISODE_STEPS):
             raise ValueError(
                 f"--env.episode_length and --env.fps must be {EPISODE_STEPS} and {FPS}, got {self.episode_length} and "
@@ -80,7 +89,8 @@ class DynmapEnvConfig(EnvConfig):
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, VectorEnv]]:
         """Make one vector environment of ``n_envs`` scenes, as ``{suite: {number: environments}}``."""
-        makers = [partial(_make, self.gym_id, self.gym_kwargs, self.split)] * n_envs
+        delay = FrameDelay(self.delay, self.jitter, self.lost)
+        makers = [partial(make_env, self.gym_id, self.gym_kwargs, self.split, delay)] * n_envs
         if use_async_envs and n_envs > 1:
             envs = AsyncVectorEnv(makers, context="forkserver", autoreset_mode=AutoresetMode.SAME_STEP)
         else:
@@ -110,12 +120,18 @@ class _ForLeRobot(gym.Wrapper):
         seed = None if seed is None else scene_seed(self.split, seed)
         options = {name: value for name, value in (options or {}).items() if name != NEW_ROLLOUT_OPTION}
         observation, info = self.env.reset(seed=seed, options=options)
-        return observation, {name: value.item() for name, value in info.items()}
+        return observation, _plain(info)
 
     def step(self, action):
         *result, info = self.env.step(action)
-        return *result, {name: value.item() for name, value in info.items()}
+        return *result, _plain(info)
 
 
-def _make(gym_id: str, arguments: dict, split: str) -> gym.Env:
-    return _ForLeRobot(gym.make(gym_id, disable_env_checker=True, **arguments), split)
+def _plain(info: dict) -> dict:
+    return {name: value.item() for name, value in info.items() if isinstance(value, np.generic)}
+
+
+def make_env(gym_id: str, arguments: dict, split: str, delay: FrameDelay | None = None) -> gym.Env:
+    """Make a Gymnasium environment whose seeds and ``info`` are as LeRobot needs them."""
+    env = gym.make(gym_id, disable_env_checker=True, **arguments)
+    return _ForLeRobot(DelayFrames(env, delay) if delay else env, split)

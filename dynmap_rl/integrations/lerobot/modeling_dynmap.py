@@ -13,6 +13,8 @@ from dynmap_rl.data.augmentation import add_distractors, augment
 from dynmap_rl.keys import DYNAMICS
 from dynmap_rl.modules.actor import Actor
 from dynmap_rl.modules.checkpoints import make_policy, make_world_model
+from dynmap_rl.modules.chunk_actor import ChunkActor
+from dynmap_rl.modules.delayed_actor import DelayedActor
 from dynmap_rl.modules.precision import mixed_precision
 from dynmap_rl.modules.supervision import parse_supervision
 from dynmap_rl.objectives.joint import JointLoss
@@ -73,6 +75,9 @@ class DynmapPolicy(PreTrainedPolicy):
     def reset(self) -> None:
         """Clear the memory, as an episode begins in every environment of the batch."""
         self._memory: TensorDict | None = None
+        # Neither is a registered submodule, as the weights would be saved a second time.
+        actor = Actor(self.world_model, self.policy, mixed=self.config.mixed)
+        self._chunks = ChunkActor(actor, self.config.chunk_size, self.config.delay)
 
     def forward(self, batch: dict[str, torch.Tensor]) -> tuple[torch.Tensor, dict[str, float]]:
         """Return the joint loss on windows ``[B, T]`` from LeRobot's loader, and its terms by name."""
@@ -134,18 +139,33 @@ class DynmapPolicy(PreTrainedPolicy):
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, torch.Tensor], **kwargs) -> torch.Tensor:
-        """Return the action ``[B, 3]`` (m, m, rad) for frames ``[B, 3, 64, 64]`` and states ``[B, 5]`` of this step."""
+        """Return the action ``[B, 3]`` (m, m, rad) of this step.
+
+        Args:
+            batch: frames ``[B, 3, 64, 64]``, ``delay`` steps old, or the first of the episode; states ``[B, 5]``.
+            kwargs: not used.
+        """
         self.eval()
         pixels = to_bytes(batch[self.config.camera])
         td = TensorDict({}, [len(pixels)]) if self._memory is None else self._memory
         td = td.set("pixels", pixels).set("goal", batch[OBS_STATE][:, -2:])
-        td = Actor(self.world_model, self.policy, mixed=self.config.mixed)(td)
+        td = DelayedActor(self._chunks.actor, self.config.delay)(td)
         self._memory = td["next"]
         return td["action"]
 
     def predict_action_chunk(self, batch: dict[str, torch.Tensor], **kwargs) -> torch.Tensor:
-        """Return a chunk of one action, ``[B, 1, 3]``, since every action needs a frame."""
-        return self.select_action(batch)[:, None]
+        """Return the actions ``[B, chunk_size, 3]`` of the step of a frame and of the steps after it, by imagination.
+
+        Args:
+            batch: frames ``[B, 3, 64, 64]``; states ``[B, 5]`` or, with the number of the step in front, ``[B, 6]``.
+                Without this number, the whole last chunk has been executed since the last frame.
+            kwargs: not used.
+        """
+        self.eval()
+        state = batch[OBS_STATE]
+        numbered = state.shape[-1] > self.config.robot_state_feature.shape[0]
+        step = int(state[0, 0]) if numbered else None
+        return self._chunks.act(to_bytes(batch[self.config.camera]), state[:, -2:], step)
 
 
 def to_bytes(pixels: torch.Tensor) -> torch.Tensor:
