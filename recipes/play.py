@@ -7,7 +7,8 @@
 
 Arrows or WASD move the cart, Q and E tilt it, a pressed mouse button calls it; TAB changes the driver: hand, expert or
 policy. With a policy, the window also shows the world model's prediction, one step ahead or, in imagination (I), without
-frames. B changes between cart and block in the traces, R takes the next scene, SPACE pauses, ESC ends.
+frames. PAGE UP and PAGE DOWN make the policy's frames late; cart and block are then also drawn translucent, where the
+model believes them to be. B changes between cart and block in the traces, R takes the next scene, SPACE pauses, ESC ends.
 
 With --record, every successful episode that the hand alone drove is kept at once. At the end, the episodes become a
 LeRobot dataset with a page in runs/play; the next session adds to it.
@@ -34,6 +35,8 @@ class Config:
     expert: str | None = None
     # Step of every episode from which the world model continues without frames, as if I were pressed.
     imagine_from: int | None = None
+    # Delay of the policy's frames in control steps of 50 ms, at most 20.
+    delay: int = 0
     # First driver: hand, expert or policy; by default the policy where there is one.
     driver: str | None = None
     # Number of the first scene.
@@ -56,7 +59,7 @@ def main(config: Config) -> None:
     from dynmap_rl.data.recording.human import list_shards, next_scene, open_folder, publish_episodes
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.envs.world import CONTROL_DT, EPISODE_STEPS
-    from dynmap_rl.play.session import Session
+    from dynmap_rl.play.session import MAX_DELAY, Session
     from dynmap_rl.play.window import PlayWindow
     from dynmap_rl.reporting.dataset_page import write_dataset_page
     from dynmap_rl.runs.folder import plain_settings
@@ -74,6 +77,8 @@ def main(config: Config) -> None:
         raise ValueError(
             f"--imagine_from must be a step of 1 to {EPISODE_STEPS - 1}, with --policy, got {config.imagine_from}"
         )
+    if not 0 <= config.delay <= (MAX_DELAY if actor else 0):
+        raise ValueError(f"--delay must be 0 to {MAX_DELAY} steps, with --policy, got {config.delay}")
     if config.gif and not config.steps:
         raise ValueError("--gif needs --steps, the length of the animation")
     if config.push_to_hub and not config.record:
@@ -83,7 +88,8 @@ def main(config: Config) -> None:
         open_folder(config.record, task)
         kept, first = len(list_shards(config.record, task)), first + next_scene(config.record, task)
     # Demonstrations are of scenes for training, and every session begins with new ones.
-    session = Session(task, actor, config.expert, first, split="train" if config.record else "validation")
+    split = "train" if config.record else "validation"
+    session = Session(task, actor, config.expert, first, split, config.delay)
     if config.driver:
         if config.driver not in session.drivers:
             raise ValueError(f"--driver must be one of {', '.join(session.drivers)}, got {config.driver!r}")

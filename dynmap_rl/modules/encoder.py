@@ -112,7 +112,7 @@ class GlimpseEncoder(Encoder):
         self.register_buffer("average", _averages())  # (48, 4 * 3)
 
     def encode(self, x: torch.Tensor) -> torch.Tensor:
-        count = len(x)
+        count = x.shape[0]  # len(x) would be a constant in an export
         autocast = torch.is_autocast_enabled(x.device.type)
         dtype = torch.get_autocast_dtype(x.device.type) if autocast else self.linear.weight.dtype
         blocks = to_blocks(x).to(dtype)  # (N, 48, 16, 16), 0..255

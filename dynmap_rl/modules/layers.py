@@ -63,9 +63,9 @@ def color_weights(pixels: torch.Tensor, power: float) -> torch.Tensor:
     Returns:
         ``[..., H, W]``.
     """
-    red, green, blue = (pixels.byte() >> 4).flatten(0, -4).flatten(2).unbind(1)  # (N, H W)
-    color = ((red.short() << 8) | (green << 4) | blue).long()
-    count = torch.zeros(len(color), 4096, device=color.device)
+    red, green, blue = (pixels.byte() >> 4).short().flatten(0, -4).flatten(2).unbind(1)  # (N, H W)
+    color = (256 * red + 16 * green + blue).long()  # in ONNX, shifts of int16 are wrong
+    count = torch.zeros(color.shape[0], 4096, device=color.device)
     count.scatter_add_(1, color, torch.ones_like(color, dtype=count.dtype))
     weight = count.gather(1, color).pow(-power)
     return (weight / weight.mean(1, keepdim=True)).view(*pixels.shape[:-3], *pixels.shape[-2:])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import defaultdict, deque
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +17,11 @@ from dynmap_rl.envs.world import ACTION_LIMIT, CONTROL_DT, EPISODE_STEPS
 from dynmap_rl.experts.network import load_expert, task_of_expert
 from dynmap_rl.keys import DYNAMICS
 from dynmap_rl.modules.actor import Actor
+from dynmap_rl.modules.delayed_actor import DelayedActor
 
 DRIVERS = "hand", "expert", "policy"
 HAND_ACCELERATION = np.array([1.5, 1.5, 4.0])  # m/s^2, m/s^2, rad/s^2: at the cart's limit a tall block tips
+MAX_DELAY = 20  # control steps
 NEAR = 4.0  # 1/s, speed for each m of distance
 
 
@@ -62,8 +64,10 @@ class Session:
         expert: expert of the task; by default the one that ships with the package, where there is one.
         seed: number of the first scene.
         split: split of the scenes.
+        delay: age of the frames that the actor gets, in control steps.
 
     Attributes:
+        delay: see above; :meth:`set_delay` changes it.
         driver: one of ``hand``, ``expert``, ``policy``.
         imagining: whether world model and policy continue without frames, on predicted latents.
         hand: input of the person.
@@ -81,12 +85,19 @@ class Session:
         expert: str | Path | None = None,
         seed: int = 0,
         split: str = "validation",
+        delay: int = 0,
     ):
         self.env = DynmapBatchedEnv(task, 1, from_pixels=True)
         self.actor, self.seed, self.split = actor, seed, split
         self.expert, self.expert_task = _find_expert(self.env.task, expert or task, named=expert is not None)
         self.driver, self.hand = "policy" if actor else "hand", Hand()
-        self.restart(seed)
+        self.set_delay(delay)
+
+    def set_delay(self, delay: int) -> None:
+        """Change the age of the frames that the actor gets, 0 to 20 control steps, and begin the scene again."""
+        self.delay = min(max(delay, 0), MAX_DELAY)
+        self._follower = DelayedActor(self.actor, self.delay) if self.actor and self.delay else self.actor
+        self.restart(self.seed)
 
     @property
     def drivers(self) -> tuple[str, ...]:
@@ -120,6 +131,7 @@ class Session:
         self.trace = defaultdict(list)
         self.prediction: dict[str, np.ndarray] = {}
         self.memory = TensorDict({}, [1])  # of the actor: zero at first
+        self.frames: deque[torch.Tensor] = deque(maxlen=self.delay + 1)  # the actor gets the first
         self._note()
 
     @torch.no_grad()
@@ -156,12 +168,14 @@ class Session:
         seen = self.memory.clone()
         if self.actor:
             imagining = self.imagining and "predicted_latent" in seen
-            seen.update(self.td.select("goal") if imagining else self.td.select("goal", "pixels"))
-            self.actor.act(self.actor.observe(seen))
+            seen.update(self.td.select("goal"))
+            if not imagining:
+                seen["pixels"] = self.frames[0]
+            self._follower.act(self._follower.observe(seen))
         return seen
 
     def _predict(self, seen: TensorDict) -> None:
-        self.memory = self.actor.predict(seen)["next"]
+        self.memory = self._follower.predict(seen)["next"]
         world_model = self.actor.world_model
         states = tuple(self.memory[key] for key in ("predicted_latent", "hidden1", "hidden2"))
         frame = world_model.decode_pixels(*states)[0].clamp(0, 1) * 255
@@ -170,6 +184,7 @@ class Session:
         self.prediction |= {quantity: value[0].numpy() for quantity, value in values.items()}
 
     def _note(self) -> None:
+        self.frames.append(self.td["pixels"])
         for quantity in DYNAMICS:
             self.trace[quantity, "true"].append(self.td["dynamics", quantity][0].numpy())
             self.trace[quantity, "predicted"].append(self.prediction.get(quantity, np.full(6, np.nan)))

@@ -6,8 +6,8 @@ import os
 
 import numpy as np
 
-from dynmap_rl.envs.renderer import Renderer, pygame
-from dynmap_rl.envs.world import ACCELERATION_LIMIT, EPISODE_STEPS, VELOCITY_LIMIT
+from dynmap_rl.envs.renderer import Renderer, box, pygame
+from dynmap_rl.envs.world import ACCELERATION_LIMIT, CONTROL_DT, EPISODE_STEPS, VELOCITY_LIMIT
 from dynmap_rl.keys import DYNAMICS
 
 from .session import Session
@@ -21,6 +21,7 @@ HIGH = {"position": [1, 1, 0.5], "velocity": VELOCITY_LIMIT, "acceleration": 2 *
 HELP = (
     "arrows or WASD: move; Q, E: tilt; mouse button: go there",
     "TAB: who drives; I: imagination; B: cart or block",
+    "PAGE UP, PAGE DOWN: delay of the policy's frames",
     "R: next scene; SPACE: pause; ESC: end",
 )
 KEYS = {  # axis and sign
@@ -98,6 +99,8 @@ class PlayWindow:
             self.body = 3 - self.body
         elif key == "i" and session.actor:
             session.imagining = not session.imagining
+        elif key in ("page up", "page down"):
+            session.set_delay(session.delay + (1 if key == "page up" else -1))
         elif key == "tab":
             drivers = session.drivers
             session.driver = drivers[(drivers.index(session.driver) + 1) % len(drivers)]
@@ -114,11 +117,12 @@ class PlayWindow:
         self.screen.fill(WHITE)
         self._write(f"{session.env.task.name}: {session.driver} drives", MARGIN, MARGIN)
         self._show(self.renderer.draw(session.world, session.env.task), MARGIN)
+        if "position" in session.prediction and (session.delay or session.imagining):
+            self._show_belief(session.prediction["position"])
         right = 2 * MARGIN + size
         if "pixels" in session.prediction:
-            source = (
-                "imagination, without frames" if session.imagining else "prediction from the frame before"
-            )
+            age = round(1000 * CONTROL_DT * (session.delay + 1))
+            source = "imagination, without frames" if session.imagining else f"prediction from {age} ms ago"
             self._write(f"world model: {source}", right, MARGIN)
             self._show(session.prediction["pixels"], right)
         else:
@@ -143,12 +147,24 @@ class PlayWindow:
         )
         return (
             f"step {world.steps} of {EPISODE_STEPS}; {state}; {name}'s dynamics: black true, green predicted"
+            + (f"; frames {round(1000 * CONTROL_DT * session.delay)} ms late" if session.delay else "")
             + ("; paused" if self.paused else "")
         )
 
     def _show(self, frame: np.ndarray, x: int) -> None:
         image = pygame.image.frombuffer(np.ascontiguousarray(frame), frame.shape[1::-1], "RGB")
         self.screen.blit(pygame.transform.scale(image, (self.size, self.size)), (x, MARGIN + LINE))
+
+    def _show_belief(self, position: np.ndarray) -> None:
+        """Draw cart and block translucent where the world model predicts them."""
+        scene, layer = self.session.world.scene, pygame.Surface((self.size, self.size), pygame.SRCALPHA)
+        sizes = (scene.cart_width, scene.cart_height), (scene.block_width, scene.block_height)
+        colors = scene.cart_color, scene.block_color
+        for pose, size, color in zip((position[:3], position[3:]), sizes, colors, strict=True):
+            corners = [(x * self.size, (1 - y) * self.size) for x, y in box(*pose.tolist(), *size)]
+            pygame.draw.polygon(layer, (*color, 100), corners)
+            pygame.draw.polygon(layer, (*BLACK, 200), corners, 2)
+        self.screen.blit(layer, (MARGIN, MARGIN + LINE))
 
     def _write(self, text: str, x: int, y: int, color=BLACK) -> None:
         self.screen.blit(self.font.render(text, True, color), (x, y))

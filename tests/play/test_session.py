@@ -6,12 +6,14 @@ import torch
 from small import CONSTANTS, make_model
 from tensordict import TensorDict
 
+from dynmap_rl.envs.delay import FrameDelay
 from dynmap_rl.envs.scene import scene_seed
 from dynmap_rl.envs.tasks import TASKS
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.evaluation.rollout import roll_out
 from dynmap_rl.modules.actor import MEMORY, Actor
 from dynmap_rl.modules.checkpoints import make_policy
+from dynmap_rl.modules.delayed_actor import DelayedActor
 from dynmap_rl.play.session import Hand, Session
 
 
@@ -52,6 +54,20 @@ def test_a_policy_drives_as_in_its_evaluation(actor):
     assert np.isnan(predicted[0]).all()
     reference = expected["predicted_dynamics", "position"][0].numpy()
     np.testing.assert_allclose(predicted[1:30], reference[1:], atol=1e-5)
+
+
+def test_on_late_frames_the_policy_acts_on_the_predicted_present(actor):
+    session = Session("balance_reaching", actor, seed=3, delay=4)
+    for _ in range(12):
+        session.step()
+    late = FrameDelay(4)
+    expected = roll_out(DelayedActor(actor, 4), "balance_reaching", [scene_seed("validation", 3)], delay=late)
+    found = session.episode()
+    torch.testing.assert_close(found["dynamics", "position"], expected["dynamics", "position"][:, :12])
+    reference = expected["predicted_dynamics", "position"][0].numpy()
+    np.testing.assert_allclose(session.prediction["position"], reference[12], atol=1e-5)
+    session.set_delay(100)
+    assert session.delay == 20 and session.world.steps == 0 and session.seed == 3
 
 
 @pytest.mark.parametrize("driver", ["expert", "policy"])

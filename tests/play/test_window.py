@@ -68,8 +68,17 @@ def test_with_a_world_model_its_prediction_is_shown():
     session.step()
     before = window.draw()[28 : 28 + 64, right : right + 64]
     assert (before == session.prediction["pixels"]).all()
+    left = slice(28, 28 + 64), slice(8, 8 + 64)
+    scene = window.renderer.draw(session.world, session.env.task)
+    assert (window.draw()[left] == scene).all()
     press(window, "i")
     assert session.imagining
+    assert (window.draw()[left] != scene).any(), "cart and block as the model believes"
     session.step()
     assert (window.draw()[28 : 28 + 64, right : right + 64] == session.prediction["pixels"]).all()
+    press(window, "page up", "page up", "page up", "page down")
+    assert session.delay == 2 and session.world.steps == 0
+    session.step()
+    scene = window.renderer.draw(session.world, session.env.task)
+    assert (window.draw()[left] != scene).any()
     window.close()
