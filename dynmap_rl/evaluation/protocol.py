@@ -21,6 +21,7 @@ def evaluate(
     task: str,
     settings: Evaluation | None = None,
     delay: FrameDelay | None = None,
+    pushed: bool = False,
 ) -> dict[str, dict[str, dict]]:
     """Evaluate an actor in closed loop; all episodes run as one batch.
 
@@ -28,7 +29,8 @@ def evaluate(
         actor: see :func:`dynmap_rl.evaluation.roll_out`.
         task: name of the task.
         settings: scenes to evaluate on; default :class:`Evaluation`.
-        delay: delay of the frames; see :func:`dynmap_rl.evaluation.roll_out`.
+        delay: delay of the frames; see :func:`dynmap_rl.evaluation.roll_out`, also for the next.
+        pushed: push the cart.
 
     Returns:
         ``test`` on the shared start states and, if ``settings.paper_episodes`` is not 0, ``paper`` on others. Each has
@@ -37,7 +39,7 @@ def evaluate(
     settings = settings or Evaluation()
     seeds = scene_seeds(settings.split, settings.episodes)
     seeds += scene_seeds(settings.split, settings.paper_episodes, start=SHARED_STARTS)
-    rows = episode_rows(roll_out(actor, task, seeds, delay=delay), seeds)
+    rows = episode_rows(roll_out(actor, task, seeds, delay=delay, pushed=pushed), seeds)
     parts = {"test": rows[: settings.episodes], "paper": rows[settings.episodes :]}
     return {
         name: {"summary": summarize(part), "rows": pack_rows(part)} for name, part in parts.items() if part

@@ -11,9 +11,11 @@ from torchrl.envs import Compose, RenameTransform, TransformedEnv
 from torchrl.envs.utils import step_mdp
 from tqdm import tqdm
 
+from dynmap_rl.data.recording.plans import Plan, draw_pushes, push
 from dynmap_rl.envs.delay import FrameDelay
 from dynmap_rl.envs.delay_transform import DelayTransform
 from dynmap_rl.envs.scene import scene_seed
+from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.envs.world import EPISODE_STEPS
 from dynmap_rl.modules.delayed_actor import DelayedActor
@@ -33,6 +35,7 @@ def roll_out(
     seeds: list[int],
     keep_pixels: bool = False,
     delay: FrameDelay | None = None,
+    pushed: bool = False,
 ) -> TensorDict:
     """Run one episode of 120 steps for each scene; an episode goes on after the block is dropped.
 
@@ -44,6 +47,8 @@ def roll_out(
         keep_pixels: keep the frames in the result, each at the step at which it was taken.
         delay: delay of the frames, which are the same for the same scenes. A :class:`dynmap_rl.modules.DelayedActor`
             gets every frame that arrives; any other actor gets the newest that has arrived.
+        pushed: execute pushes in the place of some actions, which the actor is not told. They are as many and as strong
+            as in disturbed demonstrations, and the same for the same scenes.
 
     Returns:
         A TensorDict ``[E, 120]`` with ``action``, ``goal`` and ``dynamics`` at t, ``pixels`` if they are kept, and
@@ -64,10 +69,16 @@ def roll_out(
     world_model = getattr(actor, "world_model", None)
     quantities = world_model.supervision if world_model else ()
     predicted = {quantity: torch.zeros(count, 6, device=device) for quantity in quantities}
-    steps = []
-    for _ in tqdm(range(EPISODE_STEPS), f"{count} episodes", unit="step", leave=False):
+    number = get_task(task, from_file=True).pushes if pushed else 0
+    plans, steps = [Plan(seed, "", pushes=draw_pushes(seed, number)) for seed in seeds], []
+    for t in tqdm(range(EPISODE_STEPS), f"{count} episodes", unit="step", leave=False):
         dynamics = env.read_dynamics()
-        td = env.step(actor(td))
+        td = actor(td)
+        if pushed:
+            action = td["action"].double().cpu().numpy()
+            push(t, action, plans, env.worlds)
+            td["action"] = torch.as_tensor(action, dtype=torch.float32, device=device)
+        td = env.step(td)
         step = td.select(*keys).set("dynamics", dynamics)
         steps.append(step.set("predicted_dynamics", TensorDict(predicted, [count])))
         td = step_mdp(td, keep_other=False)

@@ -18,6 +18,7 @@ from datetime import date
 from pathlib import Path
 
 os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")  # as recipes do; before torch is imported
+import deploying
 import learning
 import loading
 import ppo
@@ -64,6 +65,7 @@ ROWS = {
         "evaluation, an episode of 1,000", "one at a time through the Gymnasium id", "ms", MS, "<= 0.2",
         lambda **sizes: learning.evaluation(DATASET, **sizes),
     ),
+    "onnx": ("control step in onnxruntime, one core", "the same in PyTorch", "ms", MS, "", deploying.onnx),
     "import": ("`import dynmap_rl`", "`import gymnasium`", "s", 1, "ours < 0.3 s", starting.import_package),
     "help": ("`--help` of the slowest recipe", "`import torch`", "s", 1, "ours < 1 s", starting.show_help),
 }  # fmt: skip

@@ -30,6 +30,7 @@ SMALL = {
     "windows": {"batches": 1},
     "to_tensordict": {"count": 10},
     "evaluation": {"episodes": 2, "single": 1},
+    "onnx": {"steps": 2},
     "import": {},
     "help": {"pattern": "tables.py"},
 }
@@ -79,11 +80,14 @@ def test_every_row_runs(load, recording, tmp_path, monkeypatch, row):
     if row == "processes":
         context = multiprocessing.get_context("fork")
         monkeypatch.setattr(multiprocessing, "get_context", lambda method: context)
+    if row == "onnx":
+        for name in ("onnx", "onnxruntime", "onnxscript"):
+            pytest.importorskip(name, reason="needs the extra onnx")
     if row == "ppo":
         pytest.importorskip("stable_baselines3")
         monkeypatch.setattr(load("ppo"), "GOAL", 0.0)
         monkeypatch.setattr(subprocess, "run", run_here)
-    for name in ("learning", "loading", "simulation", "starting"):
+    for name in ("deploying", "learning", "loading", "simulation", "starting"):
         monkeypatch.setattr(load(name), "compare", compare)
     run = load("run")
     monkeypatch.setattr(run, "DATASET", str(recording))
@@ -113,3 +117,16 @@ def test_commands_of_other_scripts_are_understood(load):
     for recipe, arguments in [*load("memory").COMMANDS.items(), *listed]:
         config_class = importlib.import_module(f"recipes.{recipe.replace('/', '.')}").Config
         parse_settings(config_class, read_arguments(arguments, config_class))
+
+
+@pytest.mark.slow
+def test_loops_in_real_time(load):
+    """With and without sleeping, with a policy in the loop and in a slow process."""
+    realtime = load("realtime")
+    actor = realtime.load_actor("balance_reaching")
+    late = realtime.measure(realtime.Local(realtime.DelayedActor(actor, delay=2), delay=2), 125, paced=False)
+    assert late["episodes"] >= 1 and 0 < late["latency_ms"]["p50"] <= late["latency_ms"]["worst"]
+    server = realtime.Server(delay=4, size=30, work=0.15)
+    row = realtime.measure(server, 20, paced=True)
+    server.close()
+    assert row["steps"] == 20 and server.ages and max(server.ages) > 0

@@ -111,3 +111,22 @@ def test_export_and_import_name_the_folder_that_does_not_fit(tmp_path):
     make_policy_config("act", push_to_hub=False, device="cpu").save_pretrained(tmp_path)
     with pytest.raises(ValueError, match="act"):
         import_from_lerobot(tmp_path, tmp_path / "run")
+
+
+def test_a_late_chunk_is_cut_at_the_present_step(tmp_path):
+    actor = LeRobotActor(export_to_lerobot("balance_reaching", tmp_path), cut=True)
+    calls = []
+
+    def predict(batch):
+        calls.append(batch)
+        return 10.0 * len(calls) + torch.arange(5.0)[None, :, None].expand(2, -1, 3)
+
+    actor.policy.predict_action_chunk, actor.policy.config.n_action_steps = predict, 2
+    td = TensorDict(
+        {"pixels": torch.zeros(2, 3, 64, 64, dtype=torch.uint8), "agent_pos": torch.zeros(2, 5)}, [2]
+    )
+    actions = [actor(td.set("delay", torch.tensor([[0], [delay]])))["action"][:, 0] for delay in (3, 9, 3, 3)]
+    assert torch.stack(actions).tolist() == [[10, 13], [11, 14], [20, 23], [21, 24]]
+    actor.reset()
+    assert actor(td.set("delay", torch.tensor([[0], [7]])))["action"][:, 0].tolist() == [30, 34]
+    assert len(calls) == 3

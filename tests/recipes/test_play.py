@@ -139,6 +139,8 @@ def test_without_a_display_the_error_is_one_line(tmp_path, monkeypatch):
         (["--steps", "0"], "--steps"),
         (["--gif", "film.gif"], "--steps"),
         (["--imagine_from", "20"], "--policy"),
+        (["--delay", "3"], "--policy"),
+        (["--policy", "balance_reaching", "--delay", "21"], "--delay must be 0 to 20"),
         (["--policy", "balance_reaching", "--imagine_from", "120"], "got 120"),
         (["--push_to_hub", "someone/mine"], "--record"),
         (["--expert", "bin_dropping"], "--expert"),

@@ -67,7 +67,7 @@ def plan_demonstrations(
     plans = []
     for i in range(start, start + count):
         seed = scene_seed(split, i)
-        pushes = _draw_pushes(seed, get_task(task).pushes) if i % 3 == 1 else ()
+        pushes = draw_pushes(seed, get_task(task).pushes) if i % 3 == 1 else ()
         checkpoint = checkpoints[(i // 3) % len(checkpoints)]
         plans.append(Plan(seed, checkpoint, noise=(0.0, 0.05, 0.1)[i % 3], pushes=pushes))
     return plans
@@ -119,7 +119,7 @@ def roll_out(task: str, plans: list[Plan], expert: str | Path | None = None) -> 
         action = np.stack([w.action_for(a) for w, a in zip(env.worlds, acceleration, strict=True)])
         expert_action = limit_actions(env.worlds, action)
         _add_noise(action, plans, rngs)
-        _push(t, action, plans, env.worlds)
+        push(t, action, plans, env.worlds)
         td = env.step(td.set("action", torch.from_numpy(action.astype(np.float32))))
         executed = np.stack([w.action for w in env.worlds]).astype(np.float32)
         td["action"] = torch.from_numpy(executed)
@@ -160,8 +160,15 @@ def _add_noise(action: np.ndarray, plans: list[Plan], rngs) -> None:
         action[row] += plan.noise * LARGEST_CHANGE * rngs[row].standard_normal(3)
 
 
-def _push(t: int, action: np.ndarray, plans: list[Plan], worlds: list[World]) -> None:
-    """Replace actions by pushes, each a constant acceleration that the expert can make up for."""
+def push(t: int, action: np.ndarray, plans: list[Plan], worlds: list[World]) -> None:
+    """Replace actions by pushes, each a constant acceleration that the expert can make up for.
+
+    Args:
+        t: step.
+        action: actions ``[E, 3]`` of all episodes, changed in place.
+        plans: plans of the episodes; ``scene_seed`` and ``pushes`` are used.
+        worlds: worlds of the episodes.
+    """
     for row, plan in enumerate(plans):
         for number, (start, end) in enumerate(plan.pushes):
             if start <= t < end:
@@ -169,8 +176,8 @@ def _push(t: int, action: np.ndarray, plans: list[Plan], worlds: list[World]) ->
                 action[row] = worlds[row].action + PUSH * LARGEST_CHANGE * rng.uniform(-1, 1, 3)
 
 
-def _draw_pushes(scene_seed: int, number: int) -> tuple[tuple[int, int], ...]:
-    """Draw spans of pushes, most of them early, while the cart is on its way."""
+def draw_pushes(scene_seed: int, number: int) -> tuple[tuple[int, int], ...]:
+    """Draw spans ``(start, end)`` of pushes, most of them early, while the cart is on its way."""
     rng = np.random.default_rng([scene_seed, 2])
     starts = np.sort(rng.exponential(30, number).astype(int).clip(0, EPISODE_STEPS - 25))
     return tuple((int(t), int(t + rng.integers(2, 7))) for t in starts)

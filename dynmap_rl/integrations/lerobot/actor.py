@@ -26,6 +26,8 @@ class LeRobotActor(TensorDictModuleBase):
         path: ``pretrained_model`` folder of ``lerobot-train``, or the id of a policy on the Hugging Face hub.
         device: device to run on.
         instruction: text for policies that read one; datasets of the tasks have the task's ``description``.
+        cut: on late frames, execute a chunk from its action for the present step, by the entry ``delay`` ``[B, 1]``,
+            rather than from its first action. Needs a policy with ``n_action_steps`` that predicts chunks.
 
     Raises:
         ValueError: the folder or id holds no LeRobot policy.
@@ -34,9 +36,15 @@ class LeRobotActor(TensorDictModuleBase):
     in_keys = ["pixels", "agent_pos"]
     out_keys = ["action"]
 
-    def __init__(self, path: str | Path, device: torch.device | str = "cpu", instruction: str = ""):
+    def __init__(
+        self,
+        path: str | Path,
+        device: torch.device | str = "cpu",
+        instruction: str = "",
+        cut: bool = False,
+    ):
         super().__init__()
-        self.instruction = instruction
+        self.instruction, self.cut = instruction, cut
         try:
             config = PreTrainedConfig.from_pretrained(str(path))
             config.device = str(device)
@@ -54,13 +62,22 @@ class LeRobotActor(TensorDictModuleBase):
     def reset(self) -> None:
         """Clear the memory, as all episodes of the batch begin."""
         self.policy.reset()
+        self._chunk, self._next = None, 0
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action of this step."""
         before, after = self.processors
         observation = {CAMERA: tensordict["pixels"].float() / 255, OBS_STATE: tensordict["agent_pos"]}
-        action = self.policy.select_action(
-            before({**observation, "task": [self.instruction] * len(tensordict)})
-        )
+        batch = before({**observation, "task": [self.instruction] * len(tensordict)})
+        action = self._cut(batch, tensordict["delay"]) if self.cut else self.policy.select_action(batch)
         return tensordict.set("action", after(action).to(tensordict["agent_pos"]))
+
+    def _cut(self, batch: dict, delay: torch.Tensor) -> torch.Tensor:
+        """Return the next action of the chunk; of a new chunk, that for the present step."""
+        if self._chunk is None or self._next == self.policy.config.n_action_steps:
+            self._chunk, self._next, self._first = self.policy.predict_action_chunk(batch), 0, delay
+        last = self._chunk.shape[1] - 1  # where a chunk is shorter than the delay, its last action
+        place = (self._first + self._next).clamp(max=last)[..., None].expand(-1, -1, self._chunk.shape[2])
+        self._next += 1
+        return self._chunk.gather(1, place)[:, 0]

@@ -1,0 +1,164 @@
+"""Measure success against the delay of the frames, and draw the figure and the table.
+
+    python recipes/paper/delays.py --dry_run
+    python recipes/paper/delays.py --runs balance_reaching --eval.episodes 100
+    python recipes/paper/delays.py --runs runs/tables/A,runs/tables/B --conditions stale,imagined
+    python recipes/paper/delays.py --write        # figure and table from the results alone
+
+Each run is evaluated under each condition: on stale frames; with the world model rolled forward; with a delay that is
+reported wrongly; with jitter, lost frames, and pushes that the policy is not told. A run and a condition have one JSON
+file, with a cell for each delay, written after every cell; cells that are there are skipped, so that the same command
+resumes a stopped grid. A LeRobot policy, such as ACT, is evaluated with chunks from which the actions of the delay are
+cut; train one with the command in dynmap_rl/integrations/lerobot/README.md.
+"""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from dynmap_rl.evaluation.settings import Evaluation
+from dynmap_rl.utils.cli import command_line, refuse, run_recipe
+from dynmap_rl.utils.devices import Compute
+
+RESULTS = Path(__file__).parents[1] / "results"
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of the recipe."""
+
+    # Runs with commas between: folders, hub ids, or balance_reaching (shipped); or folders of LeRobot policies.
+    runs: str = "balance_reaching"
+    # Seed of the runs' policies.
+    seed: int = 0
+    # Task; by default that of each run.
+    task: str | None = None
+    # Conditions with commas between; by default all.
+    conditions: str = ""
+    # Delays in control steps of 50 ms, with commas between; by default 0 to 30.
+    delays: str = ""
+    # Folder of the results.
+    results: Path = RESULTS / "delays"
+    # File of the figure.
+    figure: Path = RESULTS / "media/delays.png"
+    # List the cells and stop.
+    dry_run: bool = False
+    # Draw the figure and write the table, README.md in the folder of the results, from the results alone.
+    write: bool = False
+    # Evaluation in closed loop, here without the paper's protocol.
+    eval: Evaluation = Evaluation(paper_episodes=0)
+    # Device and cores.
+    compute: Compute = Compute()
+
+
+def main(config: Config) -> None:
+    """Evaluate the cells without a result; draw and write."""
+    import torch
+
+    from dynmap_rl.paper.delays import CONDITIONS, DELAYS, frame_delay
+
+    refuse(config.eval, Evaluation(paper_episodes=0), ["paper_episodes"], "recipes/paper/delays.py", "eval.")
+    if config.write:
+        return write(config)
+    conditions = config.conditions.split(",") if config.conditions else list(CONDITIONS)
+    if unknown := set(conditions) - set(CONDITIONS):
+        raise ValueError(
+            f"--conditions must be any of {','.join(CONDITIONS)}, got {','.join(sorted(unknown))}"
+        )
+    if not all(text.isdigit() for text in config.delays.split(",") if config.delays):
+        raise ValueError(f"--delays must be numbers of steps with commas between, got {config.delays}")
+    delays = [int(text) for text in config.delays.split(",")] if config.delays else DELAYS
+    torch.set_num_threads(config.compute.threads)
+    for run in config.runs.split(","):
+        for condition in conditions:
+            path, result = open_result(config, run, condition)
+            for steps in delays:
+                delay = frame_delay(condition, steps)
+                if delay is None or str(steps) in result["cells"]:
+                    continue
+                print(f"{path.stem}, {steps} steps", flush=True)
+                if not config.dry_run:
+                    evaluate_cell(config, path, result, steps)
+    if not config.dry_run:
+        write(config)
+
+
+def open_result(config: Config, run: str, condition: str) -> tuple[Path, dict]:
+    """Return file and content of the result of a run under a condition, which may be there in part."""
+    from dynmap_rl.envs.tasks import get_task
+    from dynmap_rl.runs.lookup import find_run, task_of_run
+    from dynmap_rl.utils.files import read_json
+
+    folder = find_run(run)
+    if not folder.exists():
+        raise ValueError(f"--runs must be runs or policies, got {run}; train one with recipes/decoupled.py")
+    task = config.task or task_of_run(folder) or "balance_reaching"
+    name = "_".join([get_task(task).name, *Path(run).parts[-2:], f"seed_{config.seed}", condition])
+    path = config.results / f"{name}.json"
+    facts = {"run": run, "seed": config.seed, "task": task, "condition": condition}
+    facts |= {"split": config.eval.split, "episodes": config.eval.episodes}
+    result = read_json(path) if path.exists() else facts | {"cells": {}}
+    if other := [key for key, value in facts.items() if result[key] != value]:
+        raise ValueError(
+            f"{path} has another {', '.join(other)}; choose another --results or remove the file"
+        )
+    return path, result
+
+
+def evaluate_cell(config: Config, path: Path, result: dict, steps: int) -> None:
+    """Evaluate a run under a condition with one delay, and add the cell to the file."""
+    from dynmap_rl.evaluation.protocol import evaluate
+    from dynmap_rl.paper.delays import CONDITIONS, frame_delay
+    from dynmap_rl.utils.files import write_json
+    from dynmap_rl.utils.version import find_commit
+
+    _, _, pushed, stale = CONDITIONS[result["condition"]]
+    delay = frame_delay(result["condition"], steps)
+    actor, names = load_actor(config, result["run"], None if stale else delay)
+    found = evaluate(actor, result["task"], config.eval, delay, pushed)["test"]
+    names_of_cell = "SR", "SR_interval", "DR", "DR_interval", "PE"
+    cell = {name: found["summary"][name] for name in names_of_cell}
+    cell |= {"success": found["rows"]["success"], "commit": find_commit()}
+    result |= names
+    result["cells"][str(steps)] = cell
+    result["command"] = command_line(sys.argv)
+    write_json(path, result)
+    print(f"    SR {cell['SR']:.1f} %   DR {cell['DR']:.1f} %   PE {cell['PE']:.1f} mm", flush=True)
+
+
+def load_actor(config: Config, run: str, delay) -> tuple:
+    """Return the actor of a run, which bridges a delay where one is given, and the names of its row and policy."""
+    from dynmap_rl.modules.delayed_actor import DelayedActor
+    from dynmap_rl.modules.policy import RecurrentPolicy
+    from dynmap_rl.modules.supervision import row_name
+    from dynmap_rl.runs.lookup import find_run, load_actor
+    from dynmap_rl.utils.devices import choose_device
+
+    folder = find_run(run)
+    if not (folder / "world_model").exists() and not any(folder.glob("seed_*")):
+        from dynmap_rl.integrations.lerobot import LeRobotActor
+
+        actor = LeRobotActor(folder, cut=delay is not None)
+        return actor, {"row": actor.policy.config.type, "policy": "LeRobot"}
+    actor = load_actor(folder, config.seed).to(choose_device(config.compute.device))
+    kind = "recurrent" if isinstance(actor.policy, RecurrentPolicy) else "feedforward"
+    names = {"row": row_name(actor.world_model.supervision), "policy": kind}
+    return (DelayedActor(actor, max_delay=delay.longest) if delay else actor), names
+
+
+def write(config: Config) -> None:
+    """Draw the figure and write the table from the results."""
+    from dynmap_rl.paper.delays import delay_page, plot_delays, read_delays
+    from dynmap_rl.utils.files import write_bytes
+
+    results = read_delays(config.results)
+    if not results:
+        raise ValueError(f"{config.results} must have results; run recipes/paper/delays.py first")
+    plot_delays(results, config.figure)
+    page = config.results / "README.md"
+    write_bytes(page, delay_page(results).encode())
+    print(f"written: {page}, {config.figure}")
+
+
+if __name__ == "__main__":
+    run_recipe(main, Config, sys.argv)

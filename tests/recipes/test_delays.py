@@ -1,0 +1,76 @@
+"""The grid of delays, in a small size: cells, resuming, page and figure."""
+
+import pytest
+from commands import run
+from small import CONSTANTS, make_model
+
+from dynmap_rl.modules.checkpoints import make_policy, save_policy, save_world_model
+from dynmap_rl.utils.files import read_json, write_json
+
+
+@pytest.fixture
+def grid(tmp_path):
+    """Return a function that runs the recipe on an untrained policy."""
+    world_model = make_model()
+    save_world_model(tmp_path / "trained/world_model", world_model)
+    save_policy(
+        tmp_path / "trained/seed_0/policy", make_policy(CONSTANTS, "recurrent", world_model), world_model
+    )
+    write_json(tmp_path / "trained/config.json", {"task": "balance_reaching"})
+
+    def call(*arguments):
+        common = "--runs", "trained", "--eval.episodes", 2, "--results", "found", "--figure", "delays.png"
+        return run(tmp_path, "delays", *common, *arguments)
+
+    return call
+
+
+def test_cells_are_measured_once(grid, tmp_path):
+    conditions = "--conditions", "stale,imagined,error_-3,pushed"
+    result = grid(*conditions, "--delays", "2", "--dry_run")
+    assert result.returncode == 0, result.stderr
+    assert len(result.stdout.splitlines()) == 3, "error_-3 needs a delay of three steps"
+    assert not (tmp_path / "found").exists()
+    result = grid(*conditions, "--delays", "2")
+    assert result.returncode == 0, result.stderr
+    files = {
+        path.stem.removeprefix("balance_reaching_trained_seed_0_"): path
+        for path in (tmp_path / "found").glob("*.json")
+    }
+    assert set(files) == {"stale", "imagined", "pushed"}
+    found = {name: read_json(path) for name, path in files.items()}
+    assert all(set(part["cells"]) == {"2"} and part["row"] == "RGB+[P]" for part in found.values())
+    assert len({part["cells"]["2"]["PE"] for part in found.values()}) == 3
+    before = {name: path.read_bytes() for name, path in files.items()}
+    result = grid(*conditions, "--delays", "2,4")
+    assert result.returncode == 0, result.stderr
+    for name, path in files.items():
+        assert (
+            set(read_json(path)["cells"]) == {"2", "4"}
+            and read_json(path)["cells"]["2"] == found[name]["cells"]["2"]
+        )
+        assert path.read_bytes() != before[name]
+    assert (tmp_path / "delays.png").exists()
+    page = (tmp_path / "found/README.md").read_bytes()
+    (tmp_path / "found/README.md").unlink()
+    assert grid("--write").returncode == 0
+    assert (tmp_path / "found/README.md").read_bytes() == page
+    result = grid("--conditions", "stale", "--eval.split", "validation")
+    assert result.returncode == 2 and "another split" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--conditions", "fog"], "fog"),
+        (["--delays", "2,soon"], "soon"),
+        (["--runs", "nothing"], "nothing"),
+        (["--write"], "found must have results"),
+        (["--eval.paper_episodes", "5"], "--eval.paper_episodes"),
+    ],
+)
+def test_bad_input_gets_one_clear_line(grid, tmp_path, arguments, message):
+    result = grid(*arguments)
+    assert result.returncode == 2
+    assert message in result.stderr and "Traceback" not in result.stderr
+    assert not (tmp_path / "found").exists() and not (tmp_path / "delays.png").exists()
