@@ -93,7 +93,7 @@ def open_result(config: Config, run: str, condition: str) -> tuple[Path, dict]:
     if not folder.exists():
         raise ValueError(f"--runs must be runs or policies, got {run}; train one with recipes/decoupled.py")
     task = config.task or task_of_run(folder) or "balance_reaching"
-    name = "_".join([get_task(task).name, *Path(run).parts[-2:], f"seed_{config.seed}", condition])
+    name = "_".join([get_task(task).name, *Path(run).parts[-4:], f"seed_{config.seed}", condition])
     path = config.results / f"{name}.json"
     facts = {"run": run, "seed": config.seed, "task": task, "condition": condition}
     facts |= {"split": config.eval.split, "episodes": config.eval.episodes}
