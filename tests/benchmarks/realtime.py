@@ -154,7 +154,7 @@ def measure(controller, steps: int, paced: bool) -> dict:
             late += time.perf_counter() > due
             time.sleep(max(0.0, due - time.perf_counter()))
             due = max(due, time.perf_counter() - PERIOD)  # a missed period is not made up for
-    p50, p99 = np.percentile(latencies, [50, 99])
+    p50, p99 = np.percentile(latencies, [50, 99]).tolist()
     return {
         "paced": paced,
         "steps": steps,
@@ -192,7 +192,7 @@ def main() -> None:
             row = measure(controller, options.steps, paced=not options.fast or name == "server")
             if name == "server":
                 controller.close()
-                p50, p99 = np.percentile(controller.ages, [50, 99])
+                p50, p99 = np.percentile(controller.ages, [50, 99]).tolist()
                 row["age_steps"] = {"p50": p50, "p99": p99, "worst": max(controller.ages)}
                 row |= {"steps_without_action": controller.empty, "work_s": options.work}
             found = read_json(options.output) if options.output.exists() else {"rows": {}}
