@@ -4,6 +4,8 @@ from .delay_transform import DelayTransform as DelayTransform
 from .gym_env import DynmapEnv as DynmapEnv
 from .imagination import ImaginationEnv as ImaginationEnv
 from .imagination import make_start as make_start
+from .protocol import BaseTask as BaseTask
+from .protocol import Layout as Layout
 from .scene import Scene as Scene
 from .scene import SceneRanges as SceneRanges
 from .scene import sample_scene as sample_scene

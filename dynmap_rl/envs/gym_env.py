@@ -12,7 +12,7 @@ from .renderer import Renderer, Window
 from .scene import SceneRanges, choose_ranges
 from .task import Task
 from .tasks import get_task
-from .world import ACCELERATION_LIMIT, CONTROL_DT, EPISODE_STEPS, VELOCITY_LIMIT, World
+from .world import ACCELERATION_LIMIT, CONTROL_DT, EPISODE_STEPS, VELOCITY_LIMIT
 
 ACTION_LIMITS = {"position": VELOCITY_LIMIT * CONTROL_DT, "acceleration": ACCELERATION_LIMIT}
 OBS_TYPES = ("state", "pixels", "pixels_agent_pos")
@@ -111,7 +111,7 @@ class DynmapEnv(gym.Env):
             raise ValueError(f"control must be one of {sorted(ACTION_LIMITS)}, got {control!r}")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be human, rgb_array or None, got {render_mode!r}")
-        self.task = get_task(task)
+        self.task = get_task(task, kind=Task)
         self.task_description = self.task.description
         self.obs_type = obs_type
         self.control = control
@@ -175,7 +175,7 @@ class DynmapEnv(gym.Env):
         pixels = self._frames.draw(self.world, self.task)
         if self.obs_type == "pixels":
             return pixels
-        return {"pixels": pixels, "agent_pos": agent_pos(self.world, self.task)}
+        return {"pixels": pixels, "agent_pos": self.task.agent_pos(self.world).astype(np.float32)}
 
     def _info(self) -> dict[str, np.generic]:
         return {
@@ -184,8 +184,3 @@ class DynmapEnv(gym.Env):
             "touched": np.bool_(self.world.touched),
             "position_error": np.float32(self.world.position_error),
         }
-
-
-def agent_pos(world: World, task: Task) -> np.ndarray:
-    """Return what a policy may read besides the frame, float32 ``[5]``: commanded cart pose and goal (m, m, rad, m, m)."""
-    return np.concatenate([world.commanded, task.goal(world)]).astype(np.float32)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 import os
 import warnings
+from typing import Protocol
 
 import numpy as np
 
 from .geometry import Polygon
-from .task import Task
+from .scene import Color, Scene
 from .world import World
 
 os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
@@ -20,6 +21,13 @@ with warnings.catch_warnings():
 
 
 RGB = 0xFF, 0xFF00, 0xFF0000, 0  # masks of a surface whose bytes are those of a frame
+
+
+class Marked(Protocol):
+    """Part of a task that is drawn."""
+
+    def markers(self, scene: Scene) -> list[tuple[Polygon, Color]]:
+        """Return the polygons (m) behind cart and block, with their colours."""
 
 
 class Renderer:
@@ -37,7 +45,7 @@ class Renderer:
         self.canvas = pygame.Surface((self.scale, self.scale), 0, 24, RGB)
         self.frame = pygame.Surface((size, size), 0, 24, RGB) if supersample > 1 else self.canvas
 
-    def draw(self, world: World, task: Task) -> np.ndarray:
+    def draw(self, world: World, task: Marked) -> np.ndarray:
         """Draw the frame, uint8 ``[size, size, 3]`` (height, width, RGB)."""
         scene = world.scene
         self.canvas.fill(scene.background_color)

@@ -198,14 +198,16 @@ def scene_seed(split: str, index: int) -> int:
     return SPLITS[split] * SEEDS_PER_SPLIT + index
 
 
-def choose_ranges(own: SceneRanges, ranges: SceneRanges | None) -> SceneRanges:
+def choose_ranges(own: SceneRanges | None, ranges: SceneRanges | None) -> SceneRanges | None:
     """Return ``ranges``, or a task's ``own`` ones for None.
 
     Raises:
-        ValueError: scenes of ``ranges`` lack factors of the task.
+        ValueError: scenes of ``ranges`` lack factors of the task, or the task has no ranges.
     """
     if ranges is None:
         return own
+    if own is None:
+        raise ValueError("ranges have no effect in a task without ranges; leave them out")
     if not issubclass(ranges.scene, own.scene):
         raise ValueError(f"ranges must be {type(own).__name__} in this task, got {type(ranges).__name__}")
     return ranges

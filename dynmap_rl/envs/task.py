@@ -3,23 +3,46 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 
 from .geometry import Polygon, square
+from .protocol import BaseTask, Layout
+from .renderer import Renderer
 from .scene import GOAL_COLOR, Color, Scene, SceneRanges, sample_scene
-from .world import ACCELERATION_LIMIT, VELOCITY_LIMIT, World
+from .world import (
+    ACCELERATION_LIMIT,
+    ACTION_LIMIT,
+    CONTROL_DT,
+    EPISODE_STEPS,
+    VELOCITY_LIMIT,
+    World,
+    step_worlds,
+)
 
 MARKER_SIZE = 0.04  # m
 ROCKING = 0.05  # rad, tilt of a block on the cart from which on the penalty is full
 SPEEDS, ACCELERATIONS = VELOCITY_LIMIT.tolist(), ACCELERATION_LIMIT.tolist()
 X_SPEED, Y_SPEED, SPIN = SPEEDS
 
+POSE = "cart_x", "cart_y", "cart_theta"
+BODIES = (*POSE, "block_x", "block_y", "block_theta")
+LAYOUT = Layout(
+    steps=EPISODE_STEPS,
+    fps=round(1 / CONTROL_DT),
+    action=("delta_x", "delta_y", "delta_theta"),
+    action_limit=tuple(ACTION_LIMIT.tolist()),
+    state=(*POSE, "goal_x", "goal_y"),
+    position=BODIES,
+    velocity=BODIES,
+)
 
-class Task(ABC):
-    """Scenes, goal, reward, end and success of an episode, and the markers that are drawn.
+
+class Task(BaseTask):
+    """Task of a cart and a block: scenes, goal, reward, end and success of an episode, and the markers that are drawn.
 
     A subclass must define ``name``, ``description``, ``reward`` and ``is_success``. Everything else has a default: a
     scene of cart, block and goal without walls, an episode that ends early when the block is dropped, and a green
@@ -40,19 +63,10 @@ class Task(ABC):
     """
 
     ranges: SceneRanges = SceneRanges()
+    layout: Layout = LAYOUT
     state_size: int = 16
-    symmetric: bool = False
+    planar: bool = True
     pushes: int = 6
-
-    @property
-    @abstractmethod
-    def name(self) -> str:
-        """Name of the task; a class attribute in subclasses."""
-
-    @property
-    @abstractmethod
-    def description(self) -> str:
-        """Instruction in one sentence; a class attribute in subclasses."""
 
     @abstractmethod
     def reward(self, world: World) -> float:
@@ -69,6 +83,26 @@ class Task(ABC):
     def make_world(self, scene: Scene) -> World:
         """Make the world of a scene at its start, with the walls of the task."""
         return World(scene)
+
+    def begin(self, seed: int, ranges: SceneRanges | None = None, world: World | None = None) -> World:
+        """Make the world of the scene that ``seed`` determines."""
+        return self.make_world(self.sample_scene(np.random.default_rng(seed), ranges))
+
+    def step(self, worlds: Sequence[World], actions: Sequence[np.ndarray]) -> None:
+        """Simulate one control step of every world with its position-update action ``[3]``."""
+        step_worlds(worlds, actions)
+
+    def make_renderer(self) -> Callable[[World], np.ndarray]:
+        """Return the function that draws a world, uint8 ``[64, 64, 3]``."""
+        return partial(Renderer(self.layout.image_size).draw, task=self)
+
+    def describe(self, seed: int) -> dict:
+        """Return all factors of the scene of a seed."""
+        return self.sample_scene(np.random.default_rng(seed)).to_dict()
+
+    def agent_pos(self, world: World) -> np.ndarray:
+        """Return commanded cart pose and goal, ``[5]`` (m, m, rad, m, m)."""
+        return np.concatenate([world.commanded, self.goal(world)])
 
     def goal(self, world: World) -> np.ndarray:
         """Return the goal on which policies are conditioned, ``[2]``: x and y (m)."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import math
+import re
 import sys
 
 import numpy as np
@@ -18,6 +20,7 @@ from .geometry import (
     wall_polygon,
     way_around,
 )
+from .protocol import BaseTask
 from .scene import (
     GOAL_COLOR,
     BinRanges,
@@ -207,32 +210,63 @@ class BinDropping(Task):
 TASKS = {task.name: task for task in (BalanceReaching(), BalanceReachingObstacle(), BinDropping())}
 
 
-def get_task(name: str, from_file: bool = False) -> Task:
+MUJOCO = "mujoco"  # short name of the module of the MuJoCo tasks
+MUJOCO_MODULE = "dynmap_rl.envs.mujoco"
+
+
+def get_task(name: str, from_file: bool = False, kind: type[BaseTask] = BaseTask) -> BaseTask:
     """Return the task of a name, or an instance of the class that is named ``"module:Class"``.
+
+    ``"mujoco:FetchSlide"`` names a class of :mod:`dynmap_rl.envs.mujoco`. Arguments of a class follow after another
+    colon: ``"mujoco:FetchSlide:image_size=96,cameras=2"``.
 
     Args:
         name: name of a task.
         from_file: whether the name comes from a file. A file must not run code, so the module must have been imported
             before.
+        kind: class that the task must be an instance of.
 
     Raises:
-        ValueError: there is no task of this name, or the class is not a complete subclass of :class:`Task`.
+        ValueError: there is no task of this name, or the class is not a complete subclass of ``kind``, or its arguments
+            are wrong.
     """
+    task = TASKS.get(name) or _make_task(name, from_file)
+    if not isinstance(task, kind):
+        raise ValueError(
+            f"{name} must be a {kind.__name__} here, got a {type(task).__name__}; choose another --task"
+        )
+    return task
+
+
+def _make_task(name: str, from_file: bool) -> BaseTask:
+    """Make an instance of the class that is named ``"module:Class"`` or ``"module:Class:argument=value,..."``."""
     if ":" not in name:
-        if name not in TASKS:
-            raise ValueError(f"the task must be one of {sorted(TASKS)} or module:Class, got {name!r}")
-        return TASKS[name]
-    module, attribute = name.split(":", 1)
+        raise ValueError(f"the task must be one of {sorted(TASKS)} or module:Class, got {name!r}")
+    module, attribute, *rest = name.split(":", 2)
     if not module or module.startswith("."):
         raise ValueError(f"the task must be named as module:Class, got {name!r}")
-    if from_file and module not in sys.modules:
+    own = module == MUJOCO
+    if from_file and not own and module not in sys.modules:
         raise ValueError(f"the task {name!r} of a file must be imported first; name it with --task {name}")
     try:
-        task = getattr(importlib.import_module(module), attribute)
+        task = getattr(importlib.import_module(MUJOCO_MODULE if own else module), attribute)
     except (ImportError, AttributeError) as error:
-        raise ValueError(f"the task must be module:Class, got {name!r} ({error})") from error
-    if not (isinstance(task, type) and issubclass(task, Task)):
+        hint = "; MuJoCo tasks need pip install '.[mujoco]'" if own and isinstance(error, ImportError) else ""
+        raise ValueError(f"the task must be module:Class, got {name!r} ({error}){hint}") from error
+    if not (isinstance(task, type) and issubclass(task, BaseTask)):
         raise ValueError(f"{name!r} must be a subclass of dynmap_rl.envs.Task, got {task!r}")
     if missing := sorted(task.__abstractmethods__):
         raise ValueError(f"the task {name!r} must define {', '.join(missing)}")
-    return task()
+    try:
+        made = task(**_parse_arguments(rest[0] if rest else ""))
+    except (TypeError, ValueError, SyntaxError) as error:
+        raise ValueError(f"the arguments of the task {name!r} are wrong ({error})") from error
+    if rest:
+        made.name = re.sub("[^a-z0-9]+", "_", f"{made.name}_{rest[0].lower()}")
+    return made
+
+
+def _parse_arguments(text: str) -> dict[str, object]:
+    """Parse ``"image_size=96,arm=True"``."""
+    pairs = (part.partition("=")[::2] for part in text.split(",") if part)
+    return {name.strip(): ast.literal_eval(value.strip()) for name, value in pairs}

@@ -14,16 +14,19 @@ from torchrl.envs import EnvBase
 from dynmap_rl.keys import DYNAMICS
 
 from .gym_env import ACTION_LIMITS
-from .renderer import Renderer
+from .protocol import BaseTask, SimulatedWorld
 from .scene import SceneRanges, choose_ranges
+from .task import Task
 from .tasks import get_task
-from .world import EPISODE_STEPS, World, step_worlds
 
 EVENTS = ("dropped", "touched", "is_success")
 
 
 class DynmapBatchedEnv(EnvBase):
     """``num_envs`` worlds of a task as a TorchRL environment of batch size ``[num_envs]``.
+
+    The sizes below are those of the tasks of cart and block. Other tasks have the sizes of their layout (see
+    :class:`dynmap_rl.envs.Layout`).
 
     The class :class:`dynmap_rl.envs.DynmapEnv` specifies actions, rewards, success and the end of an episode. The same
     seeds and actions give the same trajectories as the Gymnasium ids, with any ``num_envs``. The environment does not
@@ -43,10 +46,10 @@ class DynmapBatchedEnv(EnvBase):
     ``env.reset(list_of_kwargs=[{"scene_seed": ...}, ...])``, one for each process.
 
     Args:
-        task: name of the task, or ``"module:Class"`` of your own (see :class:`dynmap_rl.envs.Task`).
+        task: name of the task, or ``"module:Class"`` of your own (see :class:`dynmap_rl.envs.BaseTask`).
         num_envs: number of worlds N.
         from_pixels: draw a frame in each step.
-        control: ``position`` or ``acceleration`` (see :class:`dynmap_rl.envs.DynmapEnv`).
+        control: ``position`` or, in tasks of cart and block, ``acceleration`` (see :class:`dynmap_rl.envs.DynmapEnv`).
         ranges: ranges from which scenes are drawn; by default the task's own.
         seed: seed of the scenes.
         device: device of the TensorDicts; worlds are simulated on the CPU.
@@ -75,12 +78,13 @@ class DynmapBatchedEnv(EnvBase):
         if control not in ACTION_LIMITS:
             raise ValueError(f"control must be one of {sorted(ACTION_LIMITS)}, got {control!r}")
         super().__init__(device=device, batch_size=[num_envs])
-        self.task = get_task(task)
+        self.task = get_task(task, kind=BaseTask if control == "position" else Task)
+        self.layout = self.task.layout
         self.control = control
         self.ranges = choose_ranges(self.task.ranges, ranges)
-        self.renderer = Renderer() if from_pixels else None
+        self.draw = self.task.make_renderer() if from_pixels else None
         self.include_state = include_state
-        self.worlds: list[World | None] = [None] * num_envs
+        self.worlds: list[SimulatedWorld | None] = [None] * num_envs
         self._make_specs()
         self.set_seed(seed)
 
@@ -91,20 +95,22 @@ class DynmapBatchedEnv(EnvBase):
             return Unbounded((n, *shape), dtype=dtype, device=device)
 
         observation = {
-            "agent_pos": unbounded(5),
-            "goal": unbounded(2),
+            "agent_pos": unbounded(len(self.layout.state)),
+            "goal": unbounded(self.layout.goal_size),
             "position_error": unbounded(1),
             **{name: Binary(1, (n, 1), dtype=torch.bool, device=device) for name in EVENTS},
         }
         if self.include_state:
             observation["state"] = unbounded(self.task.state_size)
-            dynamics = {quantity: unbounded(6) for quantity in DYNAMICS}
+            dynamics = {name: unbounded(len(entries)) for name, entries in self.layout.dynamics.items()}
             observation["dynamics"] = Composite(dynamics, shape=(n,), device=device)
-        if self.renderer:
-            observation["pixels"] = Bounded(0, 255, (n, 3, 64, 64), dtype=torch.uint8, device=device)
+        if self.draw:
+            shape = n, *self.layout.frame_shape
+            observation["pixels"] = Bounded(0, 255, shape, dtype=torch.uint8, device=device)
         self.observation_spec = Composite(observation, shape=(n,), device=device)
-        limit = torch.as_tensor(ACTION_LIMITS[self.control], dtype=torch.float32).expand(n, 3)
-        self.action_spec = Bounded(-limit, limit, (n, 3), dtype=torch.float32, device=device)
+        limit = self.layout.action_limit if self.control == "position" else ACTION_LIMITS[self.control]
+        limit = torch.as_tensor(limit, dtype=torch.float32).expand(n, -1)
+        self.action_spec = Bounded(-limit, limit, limit.shape, dtype=torch.float32, device=device)
         self.reward_spec = unbounded(1)
         flags = {
             k: Binary(1, (n, 1), dtype=torch.bool, device=device) for k in ("done", "terminated", "truncated")
@@ -135,8 +141,7 @@ class DynmapBatchedEnv(EnvBase):
         rows = mask.nonzero().flatten().tolist()
         for i in rows:
             seed = int(seeds[i]) if seeds is not None else int(self.rng.integers(2**63))
-            scene = self.task.sample_scene(np.random.default_rng(seed), self.ranges)
-            self.worlds[i] = self.task.make_world(scene)
+            self.worlds[i] = self.task.begin(seed, self.ranges, self.worlds[i])
         # Callers may change what they get, so the last observation is kept apart.
         if len(rows) == n:
             self._observation = self._observe(self.worlds)
@@ -148,7 +153,7 @@ class DynmapBatchedEnv(EnvBase):
         actions = tensordict["action"].detach().cpu().numpy()
         if self.control == "acceleration":
             actions = [world.action_for(a) for world, a in zip(self.worlds, actions, strict=True)]
-        step_worlds(self.worlds, actions)
+        self.task.step(self.worlds, actions)
         self._observation = self._observe(self.worlds)
         reward = torch.tensor([[self.task.reward(world)] for world in self.worlds], dtype=torch.float32)
         return self._observation.clone().set("reward", reward.to(self.device))
@@ -160,42 +165,40 @@ class DynmapBatchedEnv(EnvBase):
             TensorDict ``[N]`` with ``position``, ``velocity`` and ``acceleration`` ``[N, 6]`` (SI units; cart x, y,
             theta, block x, y, theta), the same values as the observation ``dynamics`` has with ``include_state``.
         """
-        return TensorDict(_read_dynamics(self.worlds), self.batch_size, device=self.device)
+        return TensorDict(self._read_dynamics(self.worlds), self.batch_size, device=self.device)
 
-    def _observe(self, worlds: list[World]) -> TensorDict:
+    def _observe(self, worlds: list[SimulatedWorld]) -> TensorDict:
         """Return observations and done flags of some of the worlds."""
         task = self.task
-        agent_pos = _stack(
-            itertools.chain.from_iterable((w.commanded, task.goal(w)) for w in worlds), len(worlds)
-        )
+        agent_pos = _stack((task.agent_pos(w) for w in worlds), len(worlds))
         flags = np.array([self._flags(w) for w in worlds], dtype=bool)
         flags = dict(
             zip((*EVENTS, "terminated", "truncated"), torch.from_numpy(flags).split(1, 1), strict=True)
         )
         data = {
             "agent_pos": agent_pos,
-            "goal": agent_pos[:, 3:],
+            "goal": agent_pos[:, agent_pos.shape[1] - self.layout.goal_size :],
             "position_error": torch.tensor([[w.position_error] for w in worlds], dtype=torch.float32),
             "done": flags["terminated"] | flags["truncated"],
             **flags,
         }
         if self.include_state:
             data["state"] = _stack((task.state(w) for w in worlds), len(worlds))
-            data["dynamics"] = _read_dynamics(worlds)
-        if self.renderer:
-            frames = np.stack([self.renderer.draw(w, task) for w in worlds])
+            data["dynamics"] = self._read_dynamics(worlds)
+        if self.draw:
+            frames = np.stack([self.draw(w) for w in worlds])
             data["pixels"] = torch.from_numpy(frames).permute(0, 3, 1, 2)
         return TensorDict(data, batch_size=[len(worlds)], device=self.device)
 
-    def _flags(self, world: World) -> tuple[bool, ...]:
+    def _flags(self, world: SimulatedWorld) -> tuple[bool, ...]:
         task = self.task
-        ended = task.is_over(world), world.steps >= EPISODE_STEPS
+        ended = task.is_over(world), world.steps >= self.layout.steps
         return world.dropped, bool(world.touched), task.is_success(world), *ended
 
-
-def _read_dynamics(worlds: list[World]) -> dict[str, torch.Tensor]:
-    vectors = itertools.chain.from_iterable((w.position, w.velocity, w.acceleration) for w in worlds)
-    return dict(zip(DYNAMICS, _stack(vectors, len(worlds)).split(6, 1), strict=True))
+    def _read_dynamics(self, worlds: list[SimulatedWorld]) -> dict[str, torch.Tensor]:
+        vectors = itertools.chain.from_iterable((w.position, w.velocity, w.acceleration) for w in worlds)
+        sizes = [len(entries) for entries in self.layout.dynamics.values()]
+        return dict(zip(DYNAMICS, _stack(vectors, len(worlds)).split(sizes, 1), strict=True))
 
 
 def _stack(vectors: Iterable[np.ndarray], count: int) -> torch.Tensor:

@@ -1,5 +1,6 @@
 """A frozen world model as a transform: in rollouts, collectors, processes and windows it is the world model itself."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -9,7 +10,7 @@ from torchrl.collectors import Collector, Evaluator
 from torchrl.envs import Compose, InitTracker, ParallelEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from dynmap_rl.envs import torchrl_env
+from dynmap_rl.envs.task import LAYOUT, Task
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.envs.world_model_transform import WorldModelTransform
 from dynmap_rl.modules.actor import MEMORY, Actor, LatentActor
@@ -73,7 +74,7 @@ def test_a_rollout_is_what_the_world_model_makes_of_the_sequence():
 
 @pytest.fixture
 def short_episodes(monkeypatch):
-    monkeypatch.setattr(torchrl_env, "EPISODE_STEPS", 12)
+    monkeypatch.setattr(Task, "layout", replace(LAYOUT, steps=12))
 
 
 def test_each_episode_of_a_long_rollout_begins_with_an_empty_memory(short_episodes):
