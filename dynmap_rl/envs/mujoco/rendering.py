@@ -1,0 +1,137 @@
+"""Small frames of MuJoCo scenes, drawn on a CPU in a few milliseconds.
+
+MuJoCo draws shadows and reflections in passes of their own and every pixel several times, which a GPU hides and a CPU
+does not. Without these, most of the time goes into meshes with thousands of faces, which can be hidden.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import weakref
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+os.environ.setdefault("LP_NUM_THREADS", "0")  # Mesa's threads cost more than they gain in small frames
+
+FLAGS = "SHADOW", "REFLECTION", "SKYBOX", "HAZE", "FOG"  # drawn in passes of their own
+BACKENDS = "egl", "osmesa"
+FACES = 2000  # of a mesh, from which on it is heavy
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Free camera.
+
+    Attributes:
+        name: name of the camera, and of its column in datasets.
+        lookat: point in the middle of the frame (m).
+        distance: distance from this point (m).
+        azimuth: direction of view about the vertical (degrees): 0 is along x, 90 along y.
+        elevation: direction of view above the horizontal (degrees): -90 looks straight down.
+    """
+
+    name: str
+    lookat: tuple[float, float, float]
+    distance: float
+    azimuth: float
+    elevation: float
+
+    def make(self) -> mujoco.MjvCamera:
+        """Return MuJoCo's camera."""
+        camera = mujoco.MjvCamera()
+        camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+        camera.lookat[:] = self.lookat
+        camera.distance, camera.azimuth, camera.elevation = self.distance, self.azimuth, self.elevation
+        return camera
+
+
+class FrameRenderer:
+    """Renderer of one model, without a display.
+
+    ``mujoco.Renderer`` draws with the backend that was chosen when MuJoCo was first imported, which TorchRL does.
+
+    Args:
+        model: the model; its quality of shadows, and the visibility of hidden geoms, are changed.
+        cameras: cameras, whose frames stand side by side.
+        size: side of a frame in pixels.
+        hide: numbers of the geoms that are not drawn.
+
+    Raises:
+        OSError: there is no library that draws without a display.
+    """
+
+    def __init__(self, model: mujoco.MjModel, cameras: Sequence[Camera], size: int, hide: Sequence[int] = ()):
+        model.vis.quality.shadowsize = model.vis.quality.offsamples = 0
+        model.geom_rgba[list(hide), 3] = 0
+        self.model, self.cameras = model, [camera.make() for camera in cameras]
+        self.canvas = make_canvas(size)
+        self.canvas.make_current()
+        self.context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self.context)
+        weakref.finalize(self, _free, self.canvas, self.context)
+        self.scene, self.option = mujoco.MjvScene(model, maxgeom=1000), mujoco.MjvOption()
+        for flag in FLAGS:
+            self.scene.flags[getattr(mujoco.mjtRndFlag, f"mjRND_{flag}")] = 0
+        self.rectangle, self.frame = mujoco.MjrRect(0, 0, size, size), np.empty((size, size, 3), np.uint8)
+
+    def draw(self, data: mujoco.MjData) -> np.ndarray:
+        """Draw the state of the model, uint8 ``[size, cameras * size, 3]``."""
+        self.canvas.make_current()
+        frames = []
+        for camera in self.cameras:
+            everything = mujoco.mjtCatBit.mjCAT_ALL.value
+            mujoco.mjv_updateScene(self.model, data, self.option, None, camera, everything, self.scene)
+            mujoco.mjr_render(self.rectangle, self.scene, self.context)
+            mujoco.mjr_readPixels(self.frame, None, self.rectangle, self.context)
+            frames.append(self.frame[::-1].copy())  # OpenGL's first row is the lowest
+        return np.concatenate(frames, 1)
+
+
+def _free(canvas, context: mujoco.MjrContext) -> None:
+    """Free the memory of a renderer while the libraries are still there, which is not so at the end of a process."""
+    canvas.make_current()
+    context.free()
+    canvas.free()
+
+
+def make_canvas(size: int):
+    """Return an OpenGL context of ``size`` x ``size`` pixels that needs no display.
+
+    The environment variable ``MUJOCO_GL`` chooses ``egl`` or ``osmesa``; otherwise the first that works is used.
+
+    Raises:
+        OSError: none works.
+    """
+    wanted, reasons = os.environ.get("MUJOCO_GL", "").lower(), []
+    for backend in (wanted,) if wanted in BACKENDS else BACKENDS:
+        try:
+            return importlib.import_module(f"mujoco.{backend}").GLContext(size, size)
+        except Exception as error:  # every backend raises its own kinds
+            reasons.append(f"{backend}: {error}")
+    raise OSError(
+        f"MuJoCo cannot draw without a display here ({'; '.join(reasons)}); install the Debian packages libegl1 and "
+        "libgl1-mesa-dri, or libosmesa6"
+    )
+
+
+def find_heavy(model: mujoco.MjModel, keep: Sequence[str] = ()) -> list[int]:
+    """Return the geoms with heavy meshes.
+
+    Args:
+        model: the model.
+        keep: names of bodies whose geoms, and those of all that is attached to them, are left out.
+    """
+    meshes = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)
+    heavy = meshes[model.mesh_facenum[model.geom_dataid[meshes]] > FACES]
+    return [geom for geom in heavy.tolist() if not _is_part(model, model.geom_bodyid[geom], keep)]
+
+
+def _is_part(model: mujoco.MjModel, body: int, names: Sequence[str]) -> bool:
+    """Return whether a body, or one that it is attached to, has one of the names."""
+    while body and model.body(body).name not in names:
+        body = model.body_parentid[body]
+    return bool(body)

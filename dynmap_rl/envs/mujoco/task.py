@@ -1,0 +1,224 @@
+"""A Gymnasium environment with MuJoCo as a task."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+
+from ..protocol import BaseTask, Layout
+from .bodies import Body, BodyReader
+from .rendering import Camera, FrameRenderer, find_heavy
+
+SIZES = 64, 96, 128
+ATTEMPTS = 100  # of a start that is not solved yet
+
+
+class MujocoWorld:
+    """One episode of a Gymnasium environment (see :class:`dynmap_rl.envs.protocol.SimulatedWorld`).
+
+    Args:
+        env: environment whose ``unwrapped`` has ``model`` and ``data``.
+        bodies: bodies whose dynamics are read.
+        dt: duration of a step (s).
+
+    Attributes:
+        env, model, data: the environment, and MuJoCo's model and data.
+        observation: last observation of the environment.
+        info: last ``info`` of the environment.
+        reward: last reward.
+        solved: whether any step so far was a success.
+    """
+
+    def __init__(self, env: gymnasium.Env, bodies: Sequence[Body], dt: float):
+        self.env, self.dt = env, dt
+        self.model, self.data = env.unwrapped.model, env.unwrapped.data
+        self.reader = BodyReader(self.model, bodies)
+        self.renderer: FrameRenderer | None = None
+
+    def begin(self, observation: Any, info: dict) -> None:
+        """Forget the last episode, after a reset of the environment."""
+        self.observation, self.info, self.reward = observation, info, 0.0
+        self.steps, self.solved, self.dropped, self.touched = 0, False, False, set()
+        self.position, self.velocity = self.reader.read(self.data)
+        self.acceleration = np.zeros_like(self.velocity)
+
+    def step(self, action: np.ndarray) -> None:
+        """Simulate one control step."""
+        self.observation, reward, _, _, self.info = self.env.step(action)
+        self.reward, self.steps, before = float(reward), self.steps + 1, self.velocity
+        self.position, self.velocity = self.reader.read(self.data)
+        # MuJoCo's own accelerations are those of an instant, with spikes at contacts.
+        self.acceleration = (self.velocity - before) / self.dt
+
+
+class MujocoTask(BaseTask):
+    """Task of a Gymnasium environment with MuJoCo.
+
+    A subclass must define ``name``, ``description``, ``bodies``, ``views``, ``steps``, ``fps``, ``make`` and ``goal``.
+    The environment may be any whose ``unwrapped`` has ``model`` and ``data`` and whose actions are a box that is
+    symmetric about 0. Success is ``info["is_success"]`` or ``info["success"]`` after a step.
+
+    Args:
+        image_size: side of a frame in pixels: 64, 96 or 128.
+        cameras: number of cameras, the first of ``views``.
+        arm: draw meshes of more than 2,000 faces, which slows recording down by a factor of 2 to 3. Without them the
+            frames show the gripper alone, and a policy that reads frames cannot see the arm.
+
+    Attributes:
+        bodies: bodies whose dynamics are recorded; first the object whose distance to the goal is judged, last the one
+            that the actions move, whose position a policy may read.
+        views: cameras.
+        steps: control steps of an episode.
+        fps: control steps per second.
+        action: names of the entries of an action.
+        action_limit: largest magnitude of the entries.
+        keep: bodies whose meshes are always drawn.
+        hide: bodies that are never drawn, such as those that show a controller's targets.
+
+    Raises:
+        ValueError: an argument is wrong.
+    """
+
+    bodies: tuple[Body, ...]
+    views: tuple[Camera, ...]
+    steps: int
+    fps: int
+    action: tuple[str, ...] = ("x", "y", "z", "gripper")
+    action_limit: float = 1.0
+    keep: tuple[str, ...] = ()
+    hide: tuple[str, ...] = ()
+    max_worlds = 16
+
+    def __init__(self, image_size: int = 64, cameras: int = 1, arm: bool = False):
+        if image_size not in SIZES:
+            raise ValueError(f"image_size must be one of {SIZES}, got {image_size}")
+        if not 1 <= cameras <= len(self.views):
+            raise ValueError(f"cameras must be 1 to {len(self.views)}, got {cameras}")
+        self.image_size, self.cameras, self.arm = image_size, self.views[:cameras], arm
+
+    @abstractmethod
+    def make(self) -> gymnasium.Env:
+        """Make the environment."""
+
+    @abstractmethod
+    def goal(self, world: MujocoWorld) -> np.ndarray:
+        """Return the goal on which policies are conditioned, ``[3]``: x, y and z (m)."""
+
+    def reset(self, env: gymnasium.Env, seed: int) -> tuple[Any, dict]:
+        """Reset the environment to the start that ``seed`` determines; return observation and info."""
+        return env.reset(seed=seed % 2**32)
+
+    def prepare(self, world: MujocoWorld) -> None:
+        """Bring everything that is drawn into place after a reset, such as a marker of the goal."""
+        mujoco.mj_forward(world.model, world.data)
+
+    def is_solved(self, world: MujocoWorld) -> bool:
+        """Return whether the goal is reached now."""
+        return bool(world.info.get("is_success", world.info.get("success", False)))
+
+    def is_dropped(self, world: MujocoWorld) -> bool:
+        """Return whether the object is lost."""
+        return False
+
+    def is_success(self, world: MujocoWorld) -> bool:
+        return self.is_solved(world)
+
+    @cached_property
+    def layout(self) -> Layout:
+        """Sizes and names."""
+        agent = self.bodies[-1].name
+        return Layout(
+            steps=self.steps,
+            fps=self.fps,
+            action=self.action,
+            action_limit=(self.action_limit,) * len(self.action),
+            state=tuple(f"{name}_{axis}" for name in (agent, "goal") for axis in "xyz"),
+            position=tuple(name for body in self.bodies for name in body.position_names),
+            velocity=tuple(name for body in self.bodies for name in body.velocity_names),
+            image_size=self.image_size,
+            cameras=tuple(camera.name for camera in self.cameras),
+        )
+
+    @property
+    def state_size(self) -> int:
+        """Number of entries of position, velocity and goal."""
+        return len(self.layout.position) + len(self.layout.velocity) + 3
+
+    def begin(self, seed: int, ranges: None = None, world: MujocoWorld | None = None) -> MujocoWorld:
+        """Reset an environment; starts that are solved already are left out.
+
+        Raises:
+            ValueError: the environment does not fit the task, or every start is solved already.
+        """
+        world = world or self._make_world()
+        observation, info = self.reset(world.env, seed)
+        for _ in range(ATTEMPTS):
+            self.prepare(world)
+            world.begin(observation, info)
+            world.position_error = self.distance(world)
+            if not self.is_solved(world):
+                return world
+            observation, info = world.env.reset()  # the next start of the same seed
+        raise ValueError(f"{self.name} must have starts that are not solved, got {ATTEMPTS} solved ones")
+
+    def _make_world(self) -> MujocoWorld:
+        env = self.make()
+        world, size = MujocoWorld(env, self.bodies, 1 / self.fps), len(self.action)
+        if env.action_space.shape != (size,) or not np.allclose(env.action_space.high, self.action_limit):
+            raise ValueError(
+                f"{self.name} must have actions of {size} entries within {self.action_limit}, got {env.action_space}"
+            )
+        dt = getattr(env.unwrapped, "dt", 1 / self.fps)
+        if not np.isclose(dt * self.fps, 1):
+            raise ValueError(f"fps of {self.name} must be {1 / dt:g}, the environment's, got {self.fps}")
+        return world
+
+    def step(self, worlds: Sequence[MujocoWorld], actions: Sequence[np.ndarray]) -> None:
+        """Simulate one control step of every world with its action ``[A]``, cut to the limits."""
+        for world, action in zip(worlds, actions, strict=True):
+            action = np.asarray(action, dtype=np.float32)
+            if not np.isfinite(action).all():
+                raise ValueError(f"an action must be finite numbers, got {action}")
+            world.step(action.clip(-self.action_limit, self.action_limit))
+            world.position_error = self.distance(world)
+            world.solved |= self.is_solved(world)
+            world.dropped |= self.is_dropped(world)
+
+    def make_renderer(self) -> Callable[[MujocoWorld], np.ndarray]:
+        return self._draw
+
+    def _draw(self, world: MujocoWorld) -> np.ndarray:
+        if world.renderer is None:
+            model = world.model
+            hide = [] if self.arm else find_heavy(model, self.keep)
+            hide += [
+                geom for geom in range(model.ngeom) if model.body(model.geom_bodyid[geom]).name in self.hide
+            ]
+            world.renderer = FrameRenderer(model, self.cameras, self.image_size, hide)
+        return world.renderer.draw(world.data)
+
+    def distance(self, world: MujocoWorld) -> float:
+        """Return the distance of the object to the goal (m)."""
+        return float(np.linalg.norm(world.position[:3] - self.goal(world)))
+
+    def agent_pos(self, world: MujocoWorld) -> np.ndarray:
+        """Return the position of the last body, and the goal, ``[6]`` (m)."""
+        start = len(self.layout.position) - len(self.bodies[-1].position_names)
+        return np.concatenate([world.position[start : start + 3], self.goal(world)])
+
+    def state(self, world: MujocoWorld) -> np.ndarray:
+        """Return positions, velocities and goal, float32 ``[S]`` (SI units)."""
+        parts = world.position, world.velocity, self.goal(world)
+        return np.concatenate(parts).astype(np.float32)
+
+    def reward(self, world: MujocoWorld) -> float:
+        return world.reward
+
+    def describe(self, seed: int) -> dict[str, Any]:
+        return {"seed": seed % 2**32}
