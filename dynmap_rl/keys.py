@@ -8,7 +8,8 @@ GYMNASIUM_IDS = {  # by task
     "bin_dropping": "dynmap_rl/BinDropping-v1",
 }
 
-CAMERA = "observation.images.front"  # LeRobot column of the frames
+CAMERAS = "observation.images."  # beginning of the LeRobot columns of frames
+CAMERA = f"{CAMERAS}front"  # column of the tasks of cart and block
 FRAME_SHAPE = (64, 64, 3)  # of a frame in that column: height, width, RGB
 
 NEEDED = {  # columns that every dataset of the tasks has, by the key that they are loaded as

@@ -15,7 +15,10 @@ import pyarrow as pa
 import torch
 from tensordict import TensorDict
 
-from dynmap_rl.keys import CAMERA, FRAME_SHAPE, NEEDED, OPTIONAL
+from dynmap_rl.envs.protocol import Layout
+from dynmap_rl.envs.task import LAYOUT
+from dynmap_rl.keys import CAMERAS, NEEDED, OPTIONAL
+from dynmap_rl.utils.files import check_form
 
 from .format.reading import (
     choose_splits,
@@ -41,11 +44,16 @@ META_FORM = {
     "normalization": dict.fromkeys(("action", "goal", "position", "velocity", "acceleration"), RANGE),
     "episodes": [{"episode_index": int}],
 }
-SIZES = {"observation.state": 5, "action": 3, **{NEEDED[key]: 6 for key in NEEDED if "dynamics" in key}}
-SIZES |= dict.fromkeys(OPTIONAL.values(), 1) | {"expert_action": 3}
+NAMES, NUMBERS = ("action", "state", "position", "velocity", "cameras"), ("steps", "fps", "image_size")
+LAYOUT_FORM = {
+    **{name: [str] for name in NAMES},
+    **{name: int for name in NUMBERS},
+    "action_limit": [Real],
+    "robot": str,
+}
 
 
-def load_dataset(dataset: str | Path, split: str | None = None) -> TensorDict:
+def load_dataset(dataset: str | Path, split: str | None = None, layout: Layout | None = None) -> TensorDict:
     """Load all episodes of a LeRobot v3.0 dataset, or the episodes of a split, into memory.
 
     The result has TorchRL's episode data format (TED): observations and action of step t at the root, what follows the
@@ -59,12 +67,14 @@ def load_dataset(dataset: str | Path, split: str | None = None) -> TensorDict:
     Args:
         dataset: local folder, or id of a dataset on the Hugging Face hub (``user/name``).
         split: ``train``, ``eval``, or another split that the dataset's ``info.json`` names.
+        layout: sizes and names of the task; by default those that the recording names, otherwise those of the tasks of
+            cart and block.
 
     Returns:
-        ``[E, T]`` in SI units, numbers as float32, flags as bool:
+        ``[E, T]`` in SI units, numbers as float32, flags as bool. Sizes are those of the layout; of cart and block:
 
-        - ``pixels`` uint8 ``[E, T, 3, 64, 64]``, ``agent_pos`` ``[E, T, 5]``, ``goal`` ``[E, T, 2]`` (the last two
-          entries of ``agent_pos``), ``action`` ``[E, T, 3]``
+        - ``pixels`` uint8 ``[E, T, 3, 64, 64]`` (frames of several cameras side by side), ``agent_pos`` ``[E, T, 5]``,
+          ``goal`` ``[E, T, 2]`` (the last entries of ``agent_pos``), ``action`` ``[E, T, 3]``
         - ``("dynamics", "position" | "velocity" | "acceleration")`` ``[E, T, 6]``
         - ``expert_action`` ``[E, T, 3]``, where the dataset has it: what the expert would have done, without noise and
           pushes; imitation learns it
@@ -79,13 +89,13 @@ def load_dataset(dataset: str | Path, split: str | None = None) -> TensorDict:
         ValueError: the dataset is missing, damaged, or has another form.
     """
     root = find_dataset(dataset)
-    info = read_info(root)
-    find_meta(root)
-    columns = _choose_columns(root, info)
-    table = read_table(root, info, [CAMERA, *columns.values()])
+    info, meta = read_info(root), find_meta(root)
+    layout = layout or find_layout(meta)
+    columns = _choose_columns(root, info, layout)
+    table = read_table(root, info, [*_cameras(layout), *columns.values()])
     if split is not None:
         table = _select_episodes(table, read_split(root, info, split))
-    return _build_episodes(root, info, table, columns)
+    return _build_episodes(root, info, table, columns, layout)
 
 
 def load_demonstrations(dataset: str | Path) -> tuple[dict[str, TensorDict], dict]:
@@ -108,11 +118,12 @@ def load_demonstrations(dataset: str | Path) -> tuple[dict[str, TensorDict], dic
     root = find_dataset(dataset)
     info = read_info(root)
     meta = find_meta(root)
-    columns = _choose_columns(root, info)
-    table = read_table(root, info, [CAMERA, *columns.values()])
+    layout = find_layout(meta)
+    columns = _choose_columns(root, info, layout)
+    table = read_table(root, info, [*_cameras(layout), *columns.values()])
     splits = choose_splits(root, info, np.unique(table["episode_index"].to_numpy()).tolist())
     episodes = {
-        name: _build_episodes(root, info, _select_episodes(table, members), columns)
+        name: _build_episodes(root, info, _select_episodes(table, members), columns, layout)
         for name, members in splits.items()
     }
     return episodes, meta["normalization"] if meta else normalization_constants(episodes["train"])
@@ -125,7 +136,8 @@ def load_meta(dataset: str | Path) -> dict:
         dataset: local folder or hub id.
 
     Returns:
-        ``format``, ``task``, ``expert``, ``kind``, ``splits`` (name to first episode and the one after the last),
+        ``format``, ``task``, ``layout`` (except of cart and block), ``expert``, ``kind``, ``splits`` (name to first
+        episode and the one after the last),
         ``normalization`` (see :func:`dynmap_rl.data.normalization_constants`), and ``episodes``, a dict for each:
         ``episode_index``, ``split``, ``scene_seed``, ``checkpoint``, ``noise``, ``detours``, ``pushes``, ``scene``,
         ``success``, ``dropped``, ``position_error`` (m).
@@ -160,21 +172,45 @@ def find_meta(root: Path) -> dict | None:
     return read_metadata(root / META, META_FORM)
 
 
-def _choose_columns(root: Path, info: dict) -> dict:
+def find_layout(meta: dict | None) -> Layout:
+    """Return the layout of a recording; a recording of cart and block, and an edited dataset, name none.
+
+    Args:
+        meta: content of ``meta/dynmap.json``, or None.
+
+    Raises:
+        ValueError: the layout is damaged.
+    """
+    if meta is None or "layout" not in meta:
+        return LAYOUT
+    check_form(meta["layout"], LAYOUT_FORM, f"{META}, layout")
+    return Layout.from_dict(meta["layout"])
+
+
+def _cameras(layout: Layout) -> list[str]:
+    return [f"{CAMERAS}{camera}" for camera in layout.cameras]
+
+
+def _choose_columns(root: Path, info: dict, layout: Layout) -> dict:
     """Return the columns to load, by key."""
-    features = info["features"]
-    if missing := [name for name in (CAMERA, *NEEDED.values()) if name not in features]:
+    features, cameras = info["features"], _cameras(layout)
+    if missing := [name for name in (*cameras, *NEEDED.values()) if name not in features]:
         raise ValueError(
             f"{root} must have the columns {', '.join(missing)}; add or rename them (dynamics.* are positions, "
             "velocities and accelerations), or record a dataset with recipes/collect.py"
         )
-    if (dtype := features[CAMERA]["dtype"]) != "image":
-        raise ValueError(f"{CAMERA} of {root} must be image, got {dtype}; record it with use_videos=False")
-    if (shape := tuple(features[CAMERA]["shape"])) != FRAME_SHAPE:
-        raise ValueError(
-            f"{CAMERA} of {root} must have the shape {FRAME_SHAPE}, got {shape}; resize the frames"
-        )
-    for name, size in SIZES.items():
+    expected = layout.image_size, layout.image_size, 3
+    for name in cameras:
+        if (dtype := features[name]["dtype"]) != "image":
+            raise ValueError(f"{name} of {root} must be image, got {dtype}; record it with use_videos=False")
+        if (shape := tuple(features[name]["shape"])) != expected:
+            raise ValueError(
+                f"{name} of {root} must have the shape {expected}, got {shape}; resize the frames"
+            )
+    sizes = dict.fromkeys(OPTIONAL.values(), 1) | {"expert_action": len(layout.action)}
+    sizes |= {"observation.state": len(layout.state), "action": len(layout.action)}
+    sizes |= {f"dynamics.{quantity}": len(names) for quantity, names in layout.dynamics.items()}
+    for name, size in sizes.items():
         if name in features and (shape := tuple(features[name]["shape"])) != (size,):
             raise ValueError(
                 f"{name} of {root} must have the shape ({size},), got {shape}; train on other datasets with "
@@ -187,11 +223,11 @@ def _select_episodes(table: pa.Table, members: range | list[int]) -> pa.Table:
     return table.filter(pa.array(np.isin(table["episode_index"].to_numpy(), members)))
 
 
-def _build_episodes(root: Path, info: dict, table: pa.Table, columns: dict) -> TensorDict:
+def _build_episodes(root: Path, info: dict, table: pa.Table, columns: dict, layout: Layout) -> TensorDict:
     count, steps = shape = _episodes_and_steps(root, table)
     data = {key: read_column(root, info, table, name).unflatten(0, shape) for key, name in columns.items()}
-    data["goal"] = data["agent_pos"][..., -2:].clone()
-    data["pixels"] = _decode_frames(root, table[CAMERA]).unflatten(0, shape)
+    data["goal"] = data["agent_pos"][..., -layout.goal_size :].clone()
+    data["pixels"] = _decode_frames(root, table, layout).unflatten(0, shape)
     never = torch.zeros(*shape, 1, dtype=torch.bool)
     last = never.clone()
     last[:, -1] = True
@@ -211,27 +247,30 @@ def _episodes_and_steps(root: Path, table: pa.Table) -> tuple[int, int]:
     return len(lengths), int(lengths[0])
 
 
-def _decode_frames(root: Path, column: pa.ChunkedArray) -> torch.Tensor:
-    """Decode PNG files to uint8 ``[N, 3, 64, 64]`` in threads: the decoder releases the interpreter's lock."""
-    files = image_files(root, CAMERA, column)
-    height, width, channels = FRAME_SHAPE
-    pixels = np.empty((len(files), channels, height, width), dtype=np.uint8)
+def _decode_frames(root: Path, table: pa.Table, layout: Layout) -> torch.Tensor:
+    """Decode PNG files to uint8 ``[N, 3, H, W]`` in threads: the decoder releases the interpreter's lock."""
+    side, shape = layout.image_size, (layout.image_size, layout.image_size, 3)
+    pixels = np.empty((len(table), *layout.frame_shape), dtype=np.uint8)
 
-    def decode(rows: range) -> None:
-        frames = np.empty((len(rows), *FRAME_SHAPE), dtype=np.uint8)
+    def decode(rows: range, files: pa.Array, place: slice) -> None:
+        frames = np.empty((len(rows), *shape), dtype=np.uint8)
         for i, row in enumerate(rows):
             try:
-                frame = decode_image(files[row].as_buffer(), height * width)
-                if frame.shape != FRAME_SHAPE:
-                    raise ValueError(f"must have the shape {FRAME_SHAPE}, got {frame.shape}")
+                frame = decode_image(files[row].as_buffer(), side * side)
+                if frame.shape != shape:
+                    raise ValueError(f"must have the shape {shape}, got {frame.shape}")
             except ValueError as error:
                 raise ValueError(
                     f"{root}: frame {row} {error}; restore the dataset or record it again"
                 ) from error
             frames[i] = frame
-        pixels[rows.start : rows.stop] = frames.transpose(0, 3, 1, 2)  # all at once: a sixth less time
+        pixels[rows.start : rows.stop, ..., place] = frames.transpose(
+            0, 3, 1, 2
+        )  # all at once: a sixth less time
 
-    blocks = [range(i, min(i + 500, len(files))) for i in range(0, len(files), 500)]
+    blocks = [range(i, min(i + 500, len(table))) for i in range(0, len(table), 500)]
     with ThreadPoolExecutor() as pool:
-        list(pool.map(decode, blocks))
+        for number, name in enumerate(_cameras(layout)):
+            files, place = image_files(root, name, table[name]), slice(side * number, side * (number + 1))
+            list(pool.map(lambda rows, files=files, place=place: decode(rows, files, place), blocks))
     return torch.from_numpy(pixels)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from tensordict import TensorDictBase
 
+from dynmap_rl.envs.protocol import Layout
 from dynmap_rl.envs.world import ACCELERATION_LIMIT, ACTION_LIMIT, VELOCITY_LIMIT
 
 
@@ -34,6 +35,41 @@ def normalization_constants(episodes: TensorDictBase) -> dict[str, dict[str, lis
         reach = np.abs(values.flatten(0, 1).double().numpy() - middle)  # [N, D]
         half = np.maximum(half, np.quantile(reach, 0.999, axis=0))
         constants[name] = {"low": (middle - half).tolist(), "high": (middle + half).tolist()}
+    return constants
+
+
+FLOORS = {"goal": 0.05, "position": 0.05, "velocity": 0.1, "acceleration": 1.0}  # m, m/s, m/s^2
+TURNS = {"velocity": 1.0, "acceleration": 10.0}  # rad/s, rad/s^2
+
+
+def layout_constants(episodes: TensorDictBase, layout: Layout) -> dict[str, dict[str, list[float]]]:
+    """Compute the range of every quantity of bodies in three dimensions.
+
+    The three entries of a point or a vector share the width of their ranges, which holds all but one in a thousand of
+    the values at either end, and is at least 0.1 m, 0.2 m/s and 2 m/s^2, or 2 rad/s and 20 rad/s^2. So a body that hardly
+    moves along an axis, or hardly turns, does not have its noise enlarged. Axes of bodies and actions have their natural
+    ranges.
+
+    Args:
+        episodes: ``[E, T]`` training episodes, as :func:`dynmap_rl.data.load_dataset` returns them.
+        layout: names of the entries.
+
+    Returns:
+        ``low`` and ``high`` ``[D]`` of action, goal, position, velocity and acceleration, in SI units.
+    """
+    limit = list(layout.action_limit)
+    constants = {"action": {"low": [-x for x in limit], "high": limit}}
+    names = {"goal": layout.state[-layout.goal_size :], **layout.dynamics}
+    for quantity, entries in names.items():
+        values = episodes["goal" if quantity == "goal" else ("dynamics", quantity)].flatten(0, 1)
+        low, high = np.quantile(values.double().numpy(), [0.001, 0.999], axis=0)
+        turning = np.array(["_omega_" in name for name in entries])
+        least = np.where(turning, TURNS.get(quantity, 0.0), FLOORS[quantity])
+        half = np.maximum((high - low).reshape(-1, 3).max(1).repeat(3) / 2, least)
+        middle = (low + high) / 2
+        axis = np.array(["axis_" in name for name in entries])
+        middle, half = np.where(axis, 0.0, middle), np.where(axis, 1.0, half)
+        constants[quantity] = {"low": (middle - half).tolist(), "high": (middle + half).tolist()}
     return constants
 
 

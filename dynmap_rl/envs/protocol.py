@@ -24,6 +24,7 @@ class Layout:
         velocity: names of the V entries of velocity and acceleration.
         image_size: side of a frame in pixels.
         cameras: names of the cameras; their frames stand side by side in ``pixels``.
+        robot: what the actions move, as datasets name it.
     """
 
     steps: int
@@ -35,6 +36,7 @@ class Layout:
     velocity: tuple[str, ...]
     image_size: int = 64
     cameras: tuple[str, ...] = ("front",)
+    robot: str = "dynmap_cart"
 
     @property
     def dt(self) -> float:
@@ -190,6 +192,12 @@ class BaseTask(ABC):
     def demonstrator(self, world: Any) -> Callable[[], np.ndarray] | None:
         """Return a function that returns the expert's next action ``[A]`` in this world, to be called in every step.
 
-        None for tasks whose experts are trained networks (see :mod:`dynmap_rl.experts`).
+        Recordings add noise to some demonstrations, but not while the function has a true attribute ``exact``. A task
+        without this method has trained networks for experts (see :mod:`dynmap_rl.experts`).
         """
         return None
+
+    @property
+    def is_scripted(self) -> bool:
+        """Whether the task has a demonstrator."""
+        return type(self).demonstrator is not BaseTask.demonstrator

@@ -17,7 +17,6 @@ from dynmap_rl.envs.delay_transform import DelayTransform
 from dynmap_rl.envs.scene import scene_seed
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
-from dynmap_rl.envs.world import EPISODE_STEPS
 from dynmap_rl.modules.delayed_actor import DelayedActor
 
 EVENTS = tuple(("next", key) for key in ("position_error", "dropped", "touched", "is_success"))
@@ -37,7 +36,9 @@ def roll_out(
     delay: FrameDelay | None = None,
     pushed: bool = False,
 ) -> TensorDict:
-    """Run one episode of 120 steps for each scene; an episode goes on after the block is dropped.
+    """Run one episode of T steps (120 of cart and block) for each scene; an episode goes on after a failure.
+
+    All episodes are one batch or, where a task limits its worlds, a few batches.
 
     Args:
         actor: reads ``pixels``, ``goal`` or ``agent_pos`` and writes ``action``, as :class:`dynmap_rl.modules.Actor`
@@ -51,30 +52,52 @@ def roll_out(
             as in disturbed demonstrations, and the same for the same scenes.
 
     Returns:
-        A TensorDict ``[E, 120]`` with ``action``, ``goal`` and ``dynamics`` at t, ``pixels`` if they are kept, and
+        A TensorDict ``[E, T]`` with ``action``, ``goal`` and ``dynamics`` at t, ``pixels`` if they are kept, and
         ``("next", "position_error" | "dropped" | "touched" | "is_success")``. ``("predicted_dynamics", quantity)`` is the
         one-step prediction of the actor's world model at t, zero at t = 0, for each quantity that it decodes.
     """
     actor = actor.eval()
+    rules, device = get_task(task), next(actor.parameters()).device
+    size = min(len(seeds), rules.max_worlds or len(seeds))
+    env = DynmapBatchedEnv(task, size, from_pixels=True, include_state=False, device=device)
+    parts = []
+    for start in range(0, len(seeds), size):
+        some = seeds[start : start + size]
+        full = some + seeds[: size - len(some)]  # a batch always has the same size
+        pushes = [draw_pushes(seed, rules.pushes if pushed else 0) for seed in full]
+        episodes = _roll_out(actor, env, full, keep_pixels, delay, pushes, f"{len(seeds)} episodes")
+        parts.append(episodes[: len(some)])
+    return torch.cat(parts)
+
+
+def _roll_out(
+    actor: TensorDictModuleBase,
+    env: DynmapBatchedEnv,
+    seeds: list[int],
+    keep_pixels: bool,
+    delay: FrameDelay | None,
+    pushes: list,
+    title: str,
+) -> TensorDict:
+    """Run one episode in every world of an environment, ``[E, T]``."""
     if hasattr(actor, "reset"):  # a LeRobot policy keeps its memory itself
         actor.reset()
-    device, count = next(actor.parameters()).device, len(seeds)
-    env = DynmapBatchedEnv(task, count, from_pixels=True, include_state=False, device=device)
+    count, device = len(seeds), env.device
     if delay:
         late = DelayTransform(delay, seeds, bursts=isinstance(actor, DelayedActor))
         env = TransformedEnv(env, Compose(RenameTransform(["pixels"], ["present"], create_copy=True), late))
-    td = env.reset(scene_seed=torch.tensor(seeds))
     pixels = "present" if delay else "pixels"
     keys = ["action", "goal", *EVENTS, *([pixels] if keep_pixels else [])]
+    td = env.reset(TensorDict({"scene_seed": torch.tensor(seeds)}, [count]))
     world_model = getattr(actor, "world_model", None)
-    quantities = world_model.supervision if world_model else ()
-    predicted = {quantity: torch.zeros(count, 6, device=device) for quantity in quantities}
-    number = get_task(task, from_file=True).pushes if pushed else 0
-    plans, steps = [Plan(seed, "", pushes=draw_pushes(seed, number)) for seed in seeds], []
-    for t in tqdm(range(EPISODE_STEPS), f"{count} episodes", unit="step", leave=False):
+    sizes = {q: len(env.layout.dynamics[q]) for q in (world_model.supervision if world_model else ())}
+    predicted = {quantity: torch.zeros(count, size, device=device) for quantity, size in sizes.items()}
+    plans = [Plan(seed, "", pushes=spans) for seed, spans in zip(seeds, pushes, strict=True)]
+    steps = []
+    for t in tqdm(range(env.layout.steps), title, unit="step", leave=False):
         dynamics = env.read_dynamics()
         td = actor(td)
-        if pushed:
+        if any(pushes):
             action = td["action"].double().cpu().numpy()
             push(t, action, plans, env.worlds)
             td["action"] = torch.as_tensor(action, dtype=torch.float32, device=device)
@@ -82,7 +105,7 @@ def roll_out(
         step = td.select(*keys).set("dynamics", dynamics)
         steps.append(step.set("predicted_dynamics", TensorDict(predicted, [count])))
         td = step_mdp(td, keep_other=False)
-        if quantities:
+        if sizes:
             predicted = world_model.decode_dynamics(td["predicted_latent"], td["hidden1"], td["hidden2"])
     episodes = torch.stack(steps, 1).cpu()
     return episodes.rename_key_(pixels, "pixels") if keep_pixels else episodes
@@ -98,7 +121,7 @@ def episode_rows(episodes: TensorDict, seeds: list[int]) -> list[dict]:
     Returns:
         Rows with ``scene_seed``, ``dropped``, ``touched`` (the cart touched a wall), ``position_error`` (m) and
         ``success``. If the world model decodes positions, ``localization_error`` is the mean distance between predicted
-        and true cart position (m), and ``localization_error_away`` its mean over the steps more than 0.1 m from the goal.
+        and true position of the first body, the cart or the object of a MuJoCo task (m), and ``localization_error_away`` its mean over the steps more than 0.1 m from the goal.
     """
     last = episodes["next"][:, -1]
     rows = [
@@ -113,8 +136,9 @@ def episode_rows(episodes: TensorDict, seeds: list[int]) -> list[dict]:
     ]
     if "position" in episodes["predicted_dynamics"].keys():
         error = episodes["predicted_dynamics", "position"] - episodes["dynamics", "position"]
-        error = error[:, 1:, :2].norm(dim=-1)  # [E, T - 1]
-        away = (episodes["dynamics", "position"][..., :2] - episodes["goal"])[:, 1:].norm(dim=-1) > 0.1
+        axes = episodes["goal"].shape[-1]  # the goal is a point in the plane or in space
+        error = error[:, 1:, :axes].norm(dim=-1)  # [E, T - 1]
+        away = (episodes["dynamics", "position"][..., :axes] - episodes["goal"])[:, 1:].norm(dim=-1) > 0.1
         away_error = (error * away).sum(1) / away.sum(1).clamp(min=1)
         for row, value, value_away in zip(rows, error.mean(1).tolist(), away_error.tolist(), strict=True):
             row["localization_error"] = round(value, 5)

@@ -5,7 +5,8 @@ import json
 import numpy as np
 
 from dynmap_rl.data.demonstrations import load_dataset
-from dynmap_rl.data.format.writing import FEATURES
+from dynmap_rl.data.format.writing import make_features
+from dynmap_rl.envs.task import LAYOUT
 from dynmap_rl.keys import DYNAMICS
 
 
@@ -13,7 +14,7 @@ def test_lerobot_reads_the_columns_and_splits(recording):
     info = json.loads((recording / "meta" / "info.json").read_text())
     assert info["splits"] == {"train": "0:4", "eval": "4:6"}
     assert (info["fps"], info["robot_type"], info["total_episodes"]) == (20, "dynmap_cart", 6)
-    for name, feature in FEATURES.items():
+    for name, feature in make_features(LAYOUT).items():
         stored = info["features"][name]
         assert (stored["dtype"], tuple(stored["shape"]), stored["names"]) == tuple(feature.values())
 

@@ -13,7 +13,6 @@ from dynmap_rl.utils.hub import first_line
 
 from ..demonstrations import META, load_dataset, load_meta
 from .quiet import quiet
-from .writing import FPS
 
 PICTURE = "picture.png"
 FOLDERS = ["data/", "meta/", "videos/", "images/"]  # all that a LeRobot dataset can have
@@ -132,7 +131,7 @@ def _describe(meta: dict, instruction: str) -> str:
         instruction=instruction,
         episodes=len(meta["episodes"]),
         steps=EPISODE_STEPS,
-        fps=FPS,
+        fps=round(1 / CONTROL_DT),
         picture=PICTURE,
         maker=maker,
         command=command,

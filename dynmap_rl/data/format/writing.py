@@ -8,78 +8,86 @@ from pathlib import Path
 import numpy as np
 from tensordict import TensorDict
 
-from dynmap_rl.envs.world import CONTROL_DT, EPISODE_STEPS
-from dynmap_rl.keys import CAMERA
+from dynmap_rl.envs.protocol import Layout
+from dynmap_rl.keys import CAMERAS
 
 from ..demonstrations import load_dataset
 from .quiet import quiet
 from .reading import read_column, read_info, read_table
 
 LOCAL_ID = "dynmap_rl/recording"  # LeRobot needs an id; it is not stored
-FPS = round(1 / CONTROL_DT)
-
-POSE = ["cart_x", "cart_y", "cart_theta"]
-BODIES = [*POSE, "block_x", "block_y", "block_theta"]
-FEATURES = {
-    CAMERA: {"dtype": "image", "shape": (64, 64, 3), "names": ["height", "width", "channels"]},
-    "observation.state": {"dtype": "float32", "shape": (5,), "names": [*POSE, "goal_x", "goal_y"]},
-    "action": {"dtype": "float32", "shape": (3,), "names": ["delta_x", "delta_y", "delta_theta"]},
-    "expert_action": {"dtype": "float32", "shape": (3,), "names": ["delta_x", "delta_y", "delta_theta"]},
-    "next.reward": {"dtype": "float32", "shape": (1,), "names": ["reward"]},
-    "next.done": {"dtype": "bool", "shape": (1,), "names": ["done"]},
-    "next.success": {"dtype": "bool", "shape": (1,), "names": ["success"]},
-    "disturbed": {"dtype": "bool", "shape": (1,), "names": ["disturbed"]},
-    "dynamics.position": {"dtype": "float32", "shape": (6,), "names": BODIES},
-    "dynamics.velocity": {"dtype": "float32", "shape": (6,), "names": BODIES},
-    "dynamics.acceleration": {"dtype": "float32", "shape": (6,), "names": BODIES},
-}
 
 
-def write_episodes(folder: Path, episodes: TensorDict, instruction: str) -> None:
+def make_features(layout: Layout) -> dict[str, dict]:
+    """Return LeRobot's description of the columns of a recording."""
+    side = layout.image_size
+    image = {"dtype": "image", "shape": (side, side, 3), "names": ["height", "width", "channels"]}
+
+    def vector(*names: str, dtype: str = "float32") -> dict:
+        return {"dtype": dtype, "shape": (len(names),), "names": list(names)}
+
+    return {
+        **{f"{CAMERAS}{camera}": image for camera in layout.cameras},
+        "observation.state": vector(*layout.state),
+        "action": vector(*layout.action),
+        "expert_action": vector(*layout.action),
+        "next.reward": vector("reward"),
+        "next.done": vector("done", dtype="bool"),
+        "next.success": vector("success", dtype="bool"),
+        "disturbed": vector("disturbed", dtype="bool"),
+        **{f"dynamics.{quantity}": vector(*names) for quantity, names in layout.dynamics.items()},
+    }
+
+
+def write_episodes(folder: Path, episodes: TensorDict, instruction: str, layout: Layout) -> None:
     """Write rollouts as a new dataset, and read it back.
 
     Args:
         folder: folder of the dataset, which must not exist.
-        episodes: ``[E, 120]`` with the entries of :func:`dynmap_rl.data.recording.plans.roll_out` and ``disturbed`` bool
-            ``[E, 120, 1]``.
+        episodes: ``[E, T]`` with the entries of :func:`dynmap_rl.data.recording.plans.roll_out` and ``disturbed`` bool
+            ``[E, T, 1]``.
         instruction: the task in one sentence.
+        layout: sizes and names of the task.
 
     Raises:
         OSError: the folder does not hold what was written.
     """
-    columns = _to_columns(episodes)
+    columns, features = _to_columns(episodes, layout), make_features(layout)
     with quiet():
         from lerobot.datasets import LeRobotDataset
 
         dataset = LeRobotDataset.create(
-            LOCAL_ID, FPS, FEATURES, root=folder, robot_type="dynmap_cart", use_videos=False
+            LOCAL_ID, layout.fps, features, root=folder, robot_type=layout.robot, use_videos=False
         )
         for episode in range(len(columns["action"])):
-            for t in range(EPISODE_STEPS):
+            for t in range(episodes.shape[1]):
                 frame = {name: values[episode, t] for name, values in columns.items()}
                 dataset.add_frame({**frame, "task": instruction})
             # LeRobot computes statistics in the buffer's precision, and float32 is not enough for variances.
             buffer = dataset.writer.episode_buffer
             for name in columns:
-                if FEATURES[name]["dtype"] == "float32":
+                if features[name]["dtype"] == "float32":
                     buffer[name] = [value.astype(np.float64) for value in buffer[name]]
             with _embedding_in_batches():
                 dataset.save_episode()
         dataset.finalize()
-    written = load_dataset(folder)
+    written = load_dataset(folder, layout=layout)
     # LeRobot only logs a frame that could not be written.
     for key in ("pixels", "agent_pos", "action", "dynamics", "disturbed", "expert_action"):
         if not (written[key] == episodes[key]).all():
             raise OSError(f"{key} of {folder} must be as written, got other values; check the disk")
 
 
-def merge_datasets(folders: list[Path], into: Path, splits: dict[str, list[int]]) -> TensorDict:
+def merge_datasets(
+    folders: list[Path], into: Path, splits: dict[str, list[int]], layout: Layout
+) -> TensorDict:
     """Merge datasets into a new one, with statistics of all of its frames, and load that.
 
     Args:
         folders: datasets to merge, in this order.
         into: folder of the new dataset, which must not exist.
         splits: first episode and the one after the last, by name.
+        layout: sizes and names of the task.
 
     Returns:
         All episodes, as :func:`dynmap_rl.data.load_dataset` returns them.
@@ -95,14 +103,15 @@ def merge_datasets(folders: list[Path], into: Path, splits: dict[str, list[int]]
         info = load_info(into)
         info.splits = {name: f"{first}:{end}" for name, (first, end) in splits.items()}
         write_info(info, into)
-        stats = load_stats(into) | _compute_stats(into)
+        stats = load_stats(into) | _compute_stats(into, layout)
         write_stats({name: stats[name] for name in sorted(stats)}, into)
-    return load_dataset(into)
+    return load_dataset(into, layout=layout)
 
 
-def _to_columns(episodes: TensorDict) -> dict[str, np.ndarray]:
+def _to_columns(episodes: TensorDict, layout: Layout) -> dict[str, np.ndarray]:
+    frames = episodes["pixels"].permute(0, 1, 3, 4, 2).split(layout.image_size, 3)
     columns = {
-        CAMERA: episodes["pixels"].permute(0, 1, 3, 4, 2),
+        **{f"{CAMERAS}{camera}": part for camera, part in zip(layout.cameras, frames, strict=True)},
         "observation.state": episodes["agent_pos"],
         "action": episodes["action"],
         "next.reward": episodes["next", "reward"],
@@ -115,7 +124,7 @@ def _to_columns(episodes: TensorDict) -> dict[str, np.ndarray]:
     return {name: values.numpy() for name, values in columns.items()}
 
 
-def _compute_stats(root: Path) -> dict[str, dict[str, np.ndarray]]:
+def _compute_stats(root: Path, layout: Layout) -> dict[str, dict[str, np.ndarray]]:
     """Compute the statistics of all numbers at once, in float64.
 
     LeRobot's merging averages the quantiles of the episodes. A goal is constant in an episode: all of its quantiles
@@ -123,7 +132,8 @@ def _compute_stats(root: Path) -> dict[str, dict[str, np.ndarray]]:
     """
     from lerobot.datasets.compute_stats import get_feature_stats
 
-    info, names = read_info(root), [name for name in FEATURES if name != CAMERA]
+    info, features = read_info(root), make_features(layout)
+    names = [name for name, feature in features.items() if feature["dtype"] != "image"]
     table = read_table(root, info, names)
     return {
         name: get_feature_stats(read_column(root, info, table, name).double().numpy(), axis=0, keepdims=False)

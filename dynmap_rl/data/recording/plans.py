@@ -16,6 +16,7 @@ from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.envs.world import EPISODE_STEPS, LARGEST_CHANGE, World, limit_actions
 from dynmap_rl.experts.network import list_checkpoints, load_expert
 
+SCRIPTED = "scripted"  # in the place of a checkpoint
 KEYS = [
     "pixels",
     "agent_pos",
@@ -63,11 +64,11 @@ def plan_demonstrations(
         count: number of episodes.
         expert: folder or task of the expert's checkpoints; by default the expert that ships for the task.
     """
-    checkpoints = list_checkpoints(expert or task)
+    checkpoints, pushed = find_checkpoints(task, expert), getattr(get_task(task), "pushes", 0)
     plans = []
     for i in range(start, start + count):
         seed = scene_seed(split, i)
-        pushes = draw_pushes(seed, get_task(task).pushes) if i % 3 == 1 else ()
+        pushes = draw_pushes(seed, pushed) if i % 3 == 1 else ()
         checkpoint = checkpoints[(i // 3) % len(checkpoints)]
         plans.append(Plan(seed, checkpoint, noise=(0.0, 0.05, 0.1)[i % 3], pushes=pushes))
     return plans
@@ -85,11 +86,33 @@ def plan_exploration(
         count: number of episodes.
         expert: folder or task of the expert's checkpoints; by default the expert that ships for the task.
     """
-    checkpoints = list_checkpoints(expert or task)
+    checkpoints, detours = find_checkpoints(task, expert), 0 if get_task(task).is_scripted else 3
     return [
-        Plan(scene_seed(split, i), checkpoints[i % len(checkpoints)], noise=(0.1, 0.2, 0.4)[i % 3], detours=3)
+        Plan(
+            scene_seed(split, i),
+            checkpoints[i % len(checkpoints)],
+            noise=(0.1, 0.2, 0.4)[i % 3],
+            detours=detours,
+        )
         for i in range(start, start + count)
     ]
+
+
+def find_checkpoints(task: str, expert: str | Path | None = None) -> list[str]:
+    """Return the names of the checkpoints of an expert, earliest first; a task with a demonstrator has one name.
+
+    Args:
+        task: name of the task.
+        expert: folder or task of the expert's checkpoints; by default the expert of the task.
+
+    Raises:
+        ValueError: there is no checkpoint, or the task has a demonstrator and another expert is given.
+    """
+    if not get_task(task).is_scripted:
+        return list_checkpoints(expert or task)
+    if expert not in (None, task):
+        raise ValueError(f"--expert has no effect with {task}, which has an expert of its own; leave it out")
+    return [SCRIPTED]
 
 
 def roll_out(task: str, plans: list[Plan], expert: str | Path | None = None) -> TensorDict:
@@ -101,9 +124,11 @@ def roll_out(task: str, plans: list[Plan], expert: str | Path | None = None) -> 
         expert: folder or task of the checkpoints that the plans name; by default the expert that ships for the task.
 
     Returns:
-        ``[E, 120]`` with ``pixels``, ``agent_pos``, ``goal``, ``dynamics``, ``action`` as executed, ``expert_action``
+        ``[E, T]`` with ``pixels``, ``agent_pos``, ``goal``, ``dynamics``, ``action`` as executed, ``expert_action``
         without noise and pushes, and under ``next`` ``reward``, ``done``, ``is_success``, ``dropped``, ``position_error``.
     """
+    if get_task(task).is_scripted:
+        return demonstrate(task, plans)
     n = len(plans)
     env = DynmapBatchedEnv(task, n, from_pixels=True)
     td = env.reset(TensorDict({"scene_seed": torch.tensor([p.scene_seed for p in plans])}, [n]))
@@ -129,9 +154,40 @@ def roll_out(task: str, plans: list[Plan], expert: str | Path | None = None) -> 
     return torch.stack(steps, 1)
 
 
-def mark_pushes(plans: list[Plan]) -> torch.Tensor:
-    """Return the steps in which a push acts, bool ``[E, 120, 1]``."""
-    disturbed = torch.zeros(len(plans), EPISODE_STEPS, 1, dtype=torch.bool)
+def demonstrate(task: str, plans: list[Plan]) -> TensorDict:
+    """Run the demonstrator of a task by the plans, one episode after the other.
+
+    Noise is in units of the largest action.
+
+    Args:
+        task: name of the task.
+        plans: one plan for each episode.
+
+    Returns:
+        ``[E, T]``, as :func:`roll_out` returns them.
+    """
+    env, episodes = DynmapBatchedEnv(task, 1, from_pixels=True), []
+    limit = env.action_spec.high[0]
+    for plan in plans:
+        td, steps = env.reset(TensorDict({"scene_seed": torch.tensor([plan.scene_seed])}, [1])), []
+        expert = env.task.demonstrator(env.worlds[0])
+        rng = np.random.default_rng([plan.scene_seed, 1])
+        for _ in range(env.layout.steps):
+            expert_action = torch.as_tensor(expert(), dtype=torch.float32)
+            noise = torch.from_numpy(plan.noise * rng.standard_normal(len(limit))).float() * limit
+            noise = noise * (not getattr(expert, "exact", False))
+            td["action"] = (expert_action + noise).clamp(-limit, limit)[None]
+            td["expert_action"] = expert_action.clamp(-limit, limit)[None]
+            td = env.step(td)
+            steps.append(td.select(*KEYS))
+            td = td["next"]
+        episodes.append(torch.stack(steps, 1))
+    return torch.cat(episodes)
+
+
+def mark_pushes(plans: list[Plan], steps: int) -> torch.Tensor:
+    """Return in which of the ``steps`` steps a push acts, bool ``[E, steps, 1]``."""
+    disturbed = torch.zeros(len(plans), steps, 1, dtype=torch.bool)
     for row, plan in enumerate(plans):
         for start, end in plan.pushes:
             disturbed[row, start:end] = True

@@ -16,11 +16,11 @@ from pathlib import Path
 from tqdm import tqdm
 
 from dynmap_rl.envs.tasks import get_task
-from dynmap_rl.experts.network import list_checkpoints
 from dynmap_rl.utils.files import read_json, write_json
 from dynmap_rl.utils.processes import start_worker
 
 from ..demonstrations import FORMAT, META, load_meta
+from .plans import find_checkpoints
 from .shards import Shard, merge_shards, record_shard
 
 KINDS = ("demonstrations", "exploration")
@@ -88,7 +88,7 @@ def record_dataset(
 
 def _check_settings(root: Path, settings: dict) -> None:
     get_task(settings["task"])
-    list_checkpoints(settings["expert"])
+    find_checkpoints(settings["task"], settings["expert"])
     if settings["kind"] not in KINDS:
         raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {settings['kind']!r}")
     for name in ("episodes", "eval_episodes"):

@@ -10,17 +10,15 @@ import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
 from tensordict import TensorDict
 
 from dynmap_rl.envs.tasks import get_task
-from dynmap_rl.envs.world import EPISODE_STEPS
 from dynmap_rl.utils.files import read_json, write_json
 
 from ..demonstrations import FORMAT, META
 from ..format.writing import merge_datasets, write_episodes
-from ..normalization import normalization_constants
+from ..normalization import layout_constants, normalization_constants
 from .plans import Plan, mark_pushes, plan_demonstrations, plan_exploration, roll_out
 
 ROWS = "episodes.json"  # metadata of a shard's episodes
@@ -74,16 +72,16 @@ def write_shard(folder: Path, task: str, plans: list[Plan], episodes: TensorDict
         folder: folder of the shard.
         task: name of the task.
         plans: one plan for each episode.
-        episodes: ``[E, 120]`` (see :func:`dynmap_rl.data.recording.plans.roll_out`).
+        episodes: ``[E, T]`` (see :func:`dynmap_rl.data.recording.plans.roll_out`).
 
     Raises:
         OSError: the folder does not hold what was written.
     """
     temporary = folder.with_name(f"{folder.name}.tmp")
-    columns = episodes.copy().set("disturbed", mark_pushes(plans))
+    columns = episodes.copy().set("disturbed", mark_pushes(plans, episodes.shape[1]))
     try:
         shutil.rmtree(temporary, ignore_errors=True)  # of a killed process
-        write_episodes(temporary, columns, get_task(task).description)
+        write_episodes(temporary, columns, get_task(task).description, get_task(task).layout)
         rows = [describe_episode(task, *e) for e in zip(plans, episodes, strict=True)]
         write_json(temporary / ROWS, rows)
         temporary.replace(folder)
@@ -92,12 +90,11 @@ def write_shard(folder: Path, task: str, plans: list[Plan], episodes: TensorDict
 
 
 def describe_episode(task: str, plan: Plan, episode: TensorDict) -> dict:
-    """Return the metadata of an episode ``[120]``."""
-    scene = get_task(task).sample_scene(np.random.default_rng(plan.scene_seed))
+    """Return the metadata of an episode ``[T]``."""
     end = episode["next"][-1]
     return {
         **asdict(plan),
-        "scene": scene.to_dict(),
+        "scene": get_task(task).describe(plan.scene_seed),
         "success": bool(end["is_success"]),
         "dropped": bool(end["dropped"]),
         "position_error": end["position_error"].item(),
@@ -118,14 +115,20 @@ def merge_shards(shards: list[Shard], folder: Path, settings: dict) -> None:
     rows = [{"split": s.split, **row} for s in shards for row in read_json(s.folder / ROWS, list)]
     train = settings["episodes"]
     splits = {"train": [0, train], "eval": [train, len(rows)]}
-    episodes = merge_datasets([s.folder for s in shards], folder, splits)
-    if episodes.shape != (len(rows), EPISODE_STEPS):
+    task = get_task(settings["task"])
+    layout = task.layout
+    episodes = merge_datasets([s.folder for s in shards], folder, splits, layout)
+    if episodes.shape != (len(rows), layout.steps):
         raise OSError(
-            f"{folder} must have {len(rows)} episodes of {EPISODE_STEPS} steps after merging, got "
+            f"{folder} must have {len(rows)} episodes of {layout.steps} steps after merging, got "
             f"{tuple(episodes.shape)}; check the disk"
         )
     meta = {"format": FORMAT} | {name: settings[name] for name in ("task", "expert", "kind")}
-    meta |= {"splits": splits, "normalization": normalization_constants(episodes[:train])}
+    if task.planar:
+        meta |= {"splits": splits, "normalization": normalization_constants(episodes[:train])}
+    else:
+        constants = layout_constants(episodes[:train], layout)
+        meta |= {"layout": layout.to_dict(), "splits": splits, "normalization": constants}
     meta["rejected"] = sum(_count_rejected(shard) for shard in shards)
     meta["episodes"] = [{"episode_index": i, **row} for i, row in enumerate(rows)]
     write_json(folder / META, meta)

@@ -31,6 +31,7 @@ class FetchTask(MujocoTask):
     steps = 50
     fps = 25
     hide = ("robot0:mocap",)
+    robot = "fetch"
 
     def make(self) -> gymnasium.Env:
         import gymnasium_robotics

@@ -91,6 +91,7 @@ class StrikeExpert:
     def __init__(self, world: MujocoWorld, goal: np.ndarray, steps: int):
         self.world, self.goal, self.last = world, goal[:2].copy(), steps
         self.plan: list[np.ndarray] | None = None
+        self.exact = False
 
     def __call__(self) -> np.ndarray:
         """Return the next action ``[4]``."""
@@ -102,7 +103,7 @@ class StrikeExpert:
             )
             if not ready and self.world.steps < self.LATEST:
                 return hover_behind(self.world, way, self.BEHIND, self.HEIGHT)
-            self.plan = self._search(puck.copy(), way)[::-1]
+            self.plan, self.exact = self._search(puck.copy(), way)[::-1], True
         return self.plan.pop() if self.plan else REST
 
     def _search(self, puck: np.ndarray, way: np.ndarray) -> list[np.ndarray]:

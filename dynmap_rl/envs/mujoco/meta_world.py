@@ -31,6 +31,7 @@ class MetaWorldTask(MujocoTask):
     environment: str
     fps = 80
     hide = ("mocap",)
+    robot = "sawyer"
 
     def make(self) -> gymnasium.Env:
         from metaworld.env_dict import ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE

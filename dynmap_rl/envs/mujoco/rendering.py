@@ -6,6 +6,7 @@ does not. Without these, most of the time goes into meshes with thousands of fac
 
 from __future__ import annotations
 
+import atexit
 import importlib
 import os
 import weakref
@@ -72,7 +73,9 @@ class FrameRenderer:
         self.canvas.make_current()
         self.context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self.context)
-        weakref.finalize(self, _free, self.canvas, self.context)
+        finalizer = weakref.finalize(self, _free, self.canvas, self.context)
+        finalizer.atexit = False
+        atexit.register(finalizer)  # later than MuJoCo's own, and therefore called before
         self.scene, self.option = mujoco.MjvScene(model, maxgeom=1000), mujoco.MjvOption()
         for flag in FLAGS:
             self.scene.flags[getattr(mujoco.mjtRndFlag, f"mjRND_{flag}")] = 0
@@ -92,7 +95,7 @@ class FrameRenderer:
 
 
 def _free(canvas, context: mujoco.MjrContext) -> None:
-    """Free the memory of a renderer while the libraries are still there, which is not so at the end of a process."""
+    """Free the memory of a renderer while the libraries are still there."""
     canvas.make_current()
     context.free()
     canvas.free()
@@ -127,11 +130,14 @@ def find_heavy(model: mujoco.MjModel, keep: Sequence[str] = ()) -> list[int]:
     """
     meshes = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)
     heavy = meshes[model.mesh_facenum[model.geom_dataid[meshes]] > FACES]
-    return [geom for geom in heavy.tolist() if not _is_part(model, model.geom_bodyid[geom], keep)]
+    kept = find_parts(model, keep)
+    return [geom for geom in heavy.tolist() if model.geom_bodyid[geom] not in kept]
 
 
-def _is_part(model: mujoco.MjModel, body: int, names: Sequence[str]) -> bool:
-    """Return whether a body, or one that it is attached to, has one of the names."""
-    while body and model.body(body).name not in names:
-        body = model.body_parentid[body]
-    return bool(body)
+def find_parts(model: mujoco.MjModel, names: Sequence[str]) -> set[int]:
+    """Return the numbers of the bodies of some names, and of all bodies that are attached to them."""
+    parts = {mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) for name in names}
+    for body, parent in enumerate(model.body_parentid.tolist()):  # a parent comes before its parts
+        if parent in parts and body:
+            parts.add(body)
+    return parts

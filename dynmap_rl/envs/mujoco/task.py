@@ -13,7 +13,7 @@ import numpy as np
 
 from ..protocol import BaseTask, Layout
 from .bodies import Body, BodyReader
-from .rendering import Camera, FrameRenderer, find_heavy
+from .rendering import Camera, FrameRenderer, find_heavy, find_parts
 
 SIZES = 64, 96, 128
 ATTEMPTS = 100  # of a start that is not solved yet
@@ -80,6 +80,7 @@ class MujocoTask(BaseTask):
         action_limit: largest magnitude of the entries.
         keep: bodies whose meshes are always drawn.
         hide: bodies that are never drawn, such as those that show a controller's targets.
+        robot: what the actions move, as datasets name it.
 
     Raises:
         ValueError: an argument is wrong.
@@ -93,6 +94,7 @@ class MujocoTask(BaseTask):
     action_limit: float = 1.0
     keep: tuple[str, ...] = ()
     hide: tuple[str, ...] = ()
+    robot: str = "mujoco"
     max_worlds = 16
 
     def __init__(self, image_size: int = 64, cameras: int = 1, arm: bool = False):
@@ -143,6 +145,7 @@ class MujocoTask(BaseTask):
             velocity=tuple(name for body in self.bodies for name in body.velocity_names),
             image_size=self.image_size,
             cameras=tuple(camera.name for camera in self.cameras),
+            robot=self.robot,
         )
 
     @property
@@ -197,9 +200,7 @@ class MujocoTask(BaseTask):
         if world.renderer is None:
             model = world.model
             hide = [] if self.arm else find_heavy(model, self.keep)
-            hide += [
-                geom for geom in range(model.ngeom) if model.body(model.geom_bodyid[geom]).name in self.hide
-            ]
+            hide += np.flatnonzero(np.isin(model.geom_bodyid, list(find_parts(model, self.hide)))).tolist()
             world.renderer = FrameRenderer(model, self.cameras, self.image_size, hide)
         return world.renderer.draw(world.data)
 

@@ -14,9 +14,9 @@ from lerobot.envs.utils import NEW_ROLLOUT_OPTION
 from lerobot.processor import PolicyProcessorPipeline, RenameObservationsProcessorStep
 from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 
-from dynmap_rl.data.format.writing import FPS
 from dynmap_rl.envs.delay import DelayFrames, FrameDelay
 from dynmap_rl.envs.scene import scene_seed
+from dynmap_rl.envs.task import LAYOUT
 from dynmap_rl.envs.world import EPISODE_STEPS
 from dynmap_rl.keys import CAMERA, FRAME_SHAPE, GYMNASIUM_IDS
 
@@ -43,7 +43,7 @@ class DynmapEnvConfig(EnvConfig):
     """
 
     task: str | None = "balance_reaching"
-    fps: int = FPS
+    fps: int = LAYOUT.fps
     episode_length: int = EPISODE_STEPS
     split: str = "test"
     render_size: int = 256
@@ -66,9 +66,9 @@ class DynmapEnvConfig(EnvConfig):
             raise ValueError(f"--env.task must be one of {', '.join(GYMNASIUM_IDS)}, got {self.task!r}")
         scene_seed(self.split, 0)
         FrameDelay(self.delay, self.jitter, self.lost)
-        if (self.fps, self.episode_length) != (FPS, EPISODE_STEPS):
+        if (self.fps, self.episode_length) != (LAYOUT.fps, EPISODE_STEPS):
             raise ValueError(
-                f"--env.episode_length and --env.fps must be {EPISODE_STEPS} and {FPS}, got {self.episode_length} and "
+                f"--env.episode_length and --env.fps must be {EPISODE_STEPS} and {LAYOUT.fps}, got {self.episode_length} and "
                 f"{self.fps}"
             )
 
