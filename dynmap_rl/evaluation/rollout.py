@@ -64,7 +64,7 @@ def roll_out(
     for start in range(0, len(seeds), size):
         some = seeds[start : start + size]
         full = some + seeds[: size - len(some)]  # a batch always has the same size
-        pushes = [draw_pushes(seed, rules.pushes if pushed else 0) for seed in full]
+        pushes = [draw_pushes(seed, getattr(rules, "pushes", 0) if pushed else 0) for seed in full]
         episodes = _roll_out(actor, env, full, keep_pixels, delay, pushes, f"{len(seeds)} episodes")
         parts.append(episodes[: len(some)])
     return torch.cat(parts)

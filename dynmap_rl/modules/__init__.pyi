@@ -2,6 +2,8 @@ from .actor import Actor as Actor
 from .actor import LatentActor as LatentActor
 from .actor import make_policy_module as make_policy_module
 from .actor import make_world_model_module as make_world_model_module
+from .cameras import CameraDecoders as CameraDecoders
+from .cameras import CameraEncoders as CameraEncoders
 from .checkpoints import load_policy as load_policy
 from .checkpoints import load_world_model as load_world_model
 from .checkpoints import make_policy as make_policy

@@ -17,7 +17,13 @@ POLICIES = {"feedforward": FeedforwardPolicy, "recurrent": RecurrentPolicy}
 
 
 def make_world_model(
-    constants: dict, supervision: tuple[str, ...], latent_size=64, hidden_size=128, architecture="glimpse"
+    constants: dict,
+    supervision: tuple[str, ...],
+    latent_size: int = 64,
+    hidden_size: int = 128,
+    architecture: str = "glimpse",
+    image_size: int = 64,
+    cameras: int = 1,
 ) -> WorldModel:
     """Make a world model with random weights.
 
@@ -26,10 +32,13 @@ def make_world_model(
         supervision: quantities that are decoded.
         latent_size: Z.
         hidden_size: H.
-        architecture: see :class:`dynmap_rl.modules.WorldModel`.
+        architecture: see :class:`dynmap_rl.modules.WorldModel`, as for the following arguments.
+        image_size: side of the frames of a camera.
+        cameras: number of cameras.
     """
     dynamics = {q: Normalizer(**constants[q]) for q in supervision}
-    return WorldModel(Normalizer(**constants["action"]), dynamics, latent_size, hidden_size, architecture)
+    sizes = latent_size, hidden_size, architecture, image_size, cameras
+    return WorldModel(Normalizer(**constants["action"]), dynamics, *sizes)
 
 
 def make_policy(
@@ -66,6 +75,8 @@ def save_world_model(folder: Path, model: WorldModel) -> None:
         "latent_size": model.latent_size,
         "hidden_size": model.hidden_size,
         "architecture": model.architecture,
+        "image_size": model.image_size,
+        "cameras": model.cameras,
     }
     write_json(Path(folder) / "arguments.json", arguments)
     save_weights(Path(folder) / "weights.safetensors", model)

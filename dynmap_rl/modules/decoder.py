@@ -21,14 +21,17 @@ class PlainDecoder(nn.Module):
         input_size: Z + 2 H.
         channels: channels of the maps of stride 8 and 4.
         outputs: numbers for each pixel.
+        image_size: side S of the frames, a multiple of 8.
     """
 
-    def __init__(self, input_size: int, channels: tuple[int, int] = (64, 32), outputs: int = 3):
+    def __init__(
+        self, input_size: int, channels: tuple[int, int] = (64, 32), outputs: int = 3, image_size: int = 64
+    ):
         super().__init__()
-        c1, c2 = channels
-        self.expand = nn.Linear(input_size, c1 * 64)
+        (c1, c2), side = channels, image_size // 8
+        self.expand = nn.Linear(input_size, c1 * side**2)
         self.layers = nn.Sequential(
-            nn.Unflatten(1, (c1, 8, 8)),
+            nn.Unflatten(1, (c1, side, side)),
             nn.ReLU(),
             up(c1, c2),
             nn.Conv2d(c2, outputs * BLOCK**2, 3, 1, 1),
@@ -37,12 +40,12 @@ class PlainDecoder(nn.Module):
     def forward(
         self, predicted_latent: torch.Tensor, hidden1: torch.Tensor, hidden2: torch.Tensor
     ) -> torch.Tensor:
-        """Decode ``[..., Z]`` and ``[..., H]`` twice to frames ``[..., 3, 64, 64]``, about 0..1."""
+        """Decode ``[..., Z]`` and ``[..., H]`` twice to frames ``[..., 3, S, S]``, about 0..1."""
         x = torch.cat([predicted_latent, hidden1, hidden2], -1)
         return self.draw(x.flatten(0, -2)).unflatten(0, x.shape[:-1]) + 0.5
 
     def draw(self, x: torch.Tensor) -> torch.Tensor:
-        """Map states ``[N, Z + 2 H]`` to ``[N, outputs, 64, 64]``."""
+        """Map states ``[N, Z + 2 H]`` to ``[N, outputs, S, S]``."""
         return F.pixel_shuffle(self.layers(self.expand(x)), BLOCK)
 
 
@@ -58,10 +61,11 @@ class SpriteDecoder(nn.Module):
         input_size: Z + 2 H.
         sprites: number of sprites; later ones cover earlier ones.
         side: samples of a sprite along each axis.
-        spacing: distance of the samples, in pixels.
+        spacing: distance of the samples, in pixels of a frame of 64 x 64; a sprite covers the same part of larger frames.
         colors: M.
         width: width of the MLPs that paint sprites and mix colours.
         channels: channels of the CNN's maps of stride 8 and 4.
+        image_size: side S of the frames, a multiple of 8.
     """
 
     def __init__(
@@ -73,10 +77,12 @@ class SpriteDecoder(nn.Module):
         colors: int = 6,
         width: int = 256,
         channels: tuple[int, int] = (64, 32),
+        image_size: int = 64,
     ):
         super().__init__()
-        self.sprites, self.side, self.spacing = sprites, side, spacing
-        self.masks = PlainDecoder(input_size, channels, colors)
+        self.sprites, self.side, self.spacing = sprites, side, spacing * image_size / 64
+        self.image_size = image_size
+        self.masks = PlainDecoder(input_size, channels, colors, image_size)
         self.colors = nn.Sequential(nn.Linear(input_size, width), nn.SiLU(), nn.Linear(width, 3 * colors))
         self.place = nn.Linear(input_size, sprites * 2)
         nn.init.normal_(self.place.weight, std=0.05)
@@ -89,7 +95,7 @@ class SpriteDecoder(nn.Module):
     def forward(
         self, predicted_latent: torch.Tensor, hidden1: torch.Tensor, hidden2: torch.Tensor
     ) -> torch.Tensor:
-        """Decode ``[..., Z]`` and ``[..., H]`` twice to frames ``[..., 3, 64, 64]``, about 0..1."""
+        """Decode ``[..., Z]`` and ``[..., H]`` twice to frames ``[..., 3, S, S]``, about 0..1."""
         x = torch.cat([predicted_latent, hidden1, hidden2], -1)
         frames = self.draw_canvas(x.flatten(0, -2))
         for sprite in self.draw_sprites(x.flatten(0, -2)).unbind(1):
@@ -97,22 +103,23 @@ class SpriteDecoder(nn.Module):
         return frames.unflatten(0, x.shape[:-1])
 
     def draw_canvas(self, x: torch.Tensor) -> torch.Tensor:
-        """Draw what is behind the sprites, ``[N, 3, 64, 64]``, from states ``[N, Z + 2 H]``."""
-        masks = self.masks.draw(x).float().flatten(2).softmax(1)  # (N, M, 4096)
+        """Draw what is behind the sprites, ``[N, 3, S, S]``, from states ``[N, Z + 2 H]``."""
+        masks = self.masks.draw(x).float().flatten(2).softmax(1)  # (N, M, S^2)
         colors = self.colors(x).float().view(len(x), -1, 3) + 0.5
-        return (colors.mT @ masks).unflatten(2, (64, 64))
+        return (colors.mT @ masks).unflatten(2, (self.image_size, self.image_size))
 
     def draw_sprites(self, x: torch.Tensor) -> torch.Tensor:
-        """Draw each sprite, ``[N, S, 4, 64, 64]``: colours times opacity, and opacity."""
+        """Draw each sprite, ``[N, sprites, 4, S, S]``: colours times opacity, and opacity."""
         count, side = len(x), self.side
         sprites = self.paint(x).float().view(count, self.sprites, side, 4, side)  # rows first
         opacity = (4 * sprites[..., 3:, :] - 2).sigmoid()
         color = sprites[..., :3, :] + self.tint(x).float().view(count, self.sprites, 1, 3, 1) + 0.5
         sprites = torch.cat([opacity * color, opacity], -2)
         place = self.place(x).float().view(count, self.sprites, 2)
-        across, down = (self.spacing * hat_kernels(place, side, self.spacing)).unbind(2)  # (N, S, side, 64)
-        rows = (down.mT @ sprites.flatten(3)).unflatten(3, (4, side))  # (N, S, 64, 4, side)
-        return (rows.flatten(2, 3) @ across).unflatten(2, (64, 4)).transpose(2, 3)
+        size, spacing = self.image_size, self.spacing
+        across, down = (spacing * hat_kernels(place, side, spacing, size)).unbind(2)  # (N, sprites, side, S)
+        rows = (down.mT @ sprites.flatten(3)).unflatten(3, (4, side))  # (N, sprites, S, 4, side)
+        return (rows.flatten(2, 3) @ across).unflatten(2, (size, 4)).transpose(2, 3)
 
 
 class DynamicsDecoder(nn.Module):

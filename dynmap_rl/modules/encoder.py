@@ -10,63 +10,76 @@ from .layers import BLOCK, ChannelNorm, color_weights, down, hat_kernels, make_g
 
 
 class Encoder(nn.Module):
-    """Base of the encoders: any leading axes, and chunks where no gradient is needed."""
+    """Base of the encoders: any leading axes, and chunks where no gradient is needed.
+
+    Args:
+        image_size: side S of the frames, a multiple of 8.
+    """
+
+    def __init__(self, image_size: int):
+        super().__init__()
+        self.image_size = image_size
 
     def forward(self, pixels: torch.Tensor) -> torch.Tensor:
-        """Encode frames ``[..., 3, 64, 64]`` in 0..255, uint8 or float, as latents ``[..., Z]``.
+        """Encode frames ``[..., 3, S, S]`` in 0..255, uint8 or float, as latents ``[..., Z]``.
 
         Raises:
             ValueError: the frames have another shape.
         """
-        if pixels.shape[-3:] != (3, 64, 64):
-            raise ValueError(f"pixels must be [..., 3, 64, 64], got {list(pixels.shape)}")
-        x = pixels.reshape(-1, 3, 64, 64)
+        side = self.image_size
+        if pixels.shape[-3:] != (3, side, side):
+            raise ValueError(f"pixels must be [..., 3, {side}, {side}], got {list(pixels.shape)}")
+        x = pixels.reshape(-1, 3, side, side)
         # Without gradients, chunks that fit into the processor's cache are twice as fast.
         chunks = (x,) if torch.is_grad_enabled() else x.split(64)
         return torch.cat([self.encode(chunk) for chunk in chunks]).reshape(*pixels.shape[:-3], -1)
 
     def encode(self, x: torch.Tensor) -> torch.Tensor:
-        """Encode frames ``[N, 3, 64, 64]`` in 0..255 as latents ``[N, Z]``."""
+        """Encode frames ``[N, 3, S, S]`` in 0..255 as latents ``[N, Z]``."""
         raise NotImplementedError
 
 
 class PlainEncoder(Encoder):
     """Plain CNN (the paper's form).
 
-    Three convolutions on blocks of 4 x 4 pixels end in maps of 8 x 8. The frame's mean colour, which the normalisation
+    Three convolutions on blocks of 4 x 4 pixels end in maps of stride 8. The frame's mean colour, which the normalisation
     removes, reaches the latent through a linear map of its own.
 
     Args:
         latent_size: Z.
         channels: channels of the maps of stride 4 and 8.
+        image_size: side S of the frames.
     """
 
-    def __init__(self, latent_size: int = 64, channels: tuple[int, int] = (32, 64)):
-        super().__init__()
+    def __init__(self, latent_size: int = 64, channels: tuple[int, int] = (32, 64), image_size: int = 64):
+        super().__init__(image_size)
         c1, c2 = channels
         self.stem = nn.Conv2d(3 * BLOCK**2, c1, 3, 1, 1)
         self.top = nn.Sequential(down(c1, c2), same(c2))
-        self.project = nn.Linear(c2 * 64, latent_size)
+        self.project = nn.Linear(c2 * (image_size // 8) ** 2, latent_size)
         self.color = nn.Linear(3, latent_size, bias=False)
 
     def encode(self, x: torch.Tensor) -> torch.Tensor:
         # The precision of the convolutions holds 0..255 exactly; most of the memory traffic is here.
         autocast = torch.is_autocast_enabled(x.device.type)
         dtype = torch.get_autocast_dtype(x.device.type) if autocast else self.project.weight.dtype
-        x = to_blocks(x).to(dtype)  # (N, 48, 16, 16)
-        pixels = x.permute(0, 2, 3, 1).flatten(1, 2)  # (N, 256, 48); a product is the fastest mean
-        color = (x.new_full((1, 256), 1 / 256) @ pixels).float().view(-1, 3, BLOCK**2).mean(-1) / 255 - 0.5
+        x = to_blocks(x).to(dtype)  # (N, 48, S / 4, S / 4)
+        pixels = x.permute(0, 2, 3, 1).flatten(1, 2)  # (N, S^2 / 16, 48); a product is the fastest mean
+        count = pixels.shape[1]
+        color = (x.new_full((1, count), 1 / count) @ pixels).float().view(-1, 3, BLOCK**2).mean(
+            -1
+        ) / 255 - 0.5
         # Scaling the weights replaces x / 255 - 0.5.
         weight, bias = self.stem.weight / 255, self.stem.bias - 0.5 * self.stem.weight.sum((1, 2, 3))
-        x = F.conv2d(x, weight, bias, padding=1).relu()  # (N, C, 16, 16)
-        y = self.top(x)  # (N, C, 8, 8)
+        x = F.conv2d(x, weight, bias, padding=1).relu()  # (N, C, S / 4, S / 4)
+        y = self.top(x)  # (N, C, S / 8, S / 8)
         return self.project(y.flatten(1)) + 5 * self.color(color)  # (N, Z); mean colours differ little
 
 
 class GlimpseEncoder(Encoder):
     """What K learned attention maps look at, and the frame as seen from the places where the first G of them look.
 
-    Convolutions on blocks of 4 x 4 pixels, with the context of maps of 8 x 8 added, end in attention maps of 32 x 32,
+    Convolutions on blocks of 4 x 4 pixels, with the context of maps of stride 8 added, end in attention maps of stride 2,
     to which rare colours of the frame are brighter than frequent ones. Each map pools its expected position (spatial
     softmax, Levine et al. 2016), the frame's mean colour there, and learned features. Around the positions of the first
     G maps, the encoder reads glimpses: small images that move with the map, as in DRAW (Gregor et al. 2015). In a
@@ -80,8 +93,9 @@ class GlimpseEncoder(Encoder):
         features: learned features of each map.
         glimpses: G.
         samples: samples of a glimpse along each axis.
-        spacing: distance of the samples, in pixels.
+        spacing: distance of the samples, in pixels of a frame of 64 x 64; a glimpse shows the same part of larger frames.
         width: width of the MLPs from the pooled values to the latent.
+        image_size: side S of the frames.
     """
 
     def __init__(
@@ -94,10 +108,12 @@ class GlimpseEncoder(Encoder):
         samples: int = 16,
         spacing: float = 1.5,
         width: int = 256,
+        image_size: int = 64,
     ):
-        super().__init__()
+        super().__init__(image_size)
         c1, c2 = channels
-        self.maps, self.glimpses, self.samples, self.spacing = maps, glimpses, samples, spacing
+        self.maps, self.glimpses, self.samples = maps, glimpses, samples
+        self.spacing = spacing * image_size / 64
         self.stem = nn.Conv2d(3 * BLOCK**2, c1, 1)
         self.mix = nn.Sequential(nn.Conv2d(c1, c1, 3, 1, 1), ChannelNorm(c1))
         self.context = nn.Sequential(down(c1, c2), same(c2), nn.Conv2d(c2, c1, 1))
@@ -108,27 +124,27 @@ class GlimpseEncoder(Encoder):
         self.mlp = nn.Sequential(nn.Linear(pooled + width, width), nn.SiLU(), nn.Linear(width, latent_size))
         self.linear = nn.Linear(pooled + width, latent_size)
         # A constant product in the place of sums over strided memory, which are several times as slow.
-        self.register_buffer("places", _split_blocks(make_grid(32).permute(2, 0, 1)[None]).mT)  # (1, 1024, 2)
+        self.register_buffer("places", _split_blocks(make_grid(image_size // 2).permute(2, 0, 1)[None]).mT)
         self.register_buffer("average", _averages())  # (48, 4 * 3)
 
     def encode(self, x: torch.Tensor) -> torch.Tensor:
         count = x.shape[0]  # len(x) would be a constant in an export
         autocast = torch.is_autocast_enabled(x.device.type)
         dtype = torch.get_autocast_dtype(x.device.type) if autocast else self.linear.weight.dtype
-        blocks = to_blocks(x).to(dtype)  # (N, 48, 16, 16), 0..255
+        blocks = to_blocks(x).to(dtype)  # (N, 48, S / 4, S / 4), 0..255
         # Scaling the weights replaces blocks / 255 - 0.5.
         weight, bias = self.stem.weight / 255, self.stem.bias - 0.5 * self.stem.weight.sum((1, 2, 3))
         h = self.mix(F.conv2d(blocks, weight, bias).relu())
         h = (h + F.interpolate(self.context(h.relu()), scale_factor=2)).relu()
         # One row of memory for each map: SUB x SUB places in a block, then the blocks.
-        logits = self.attend(h).float().contiguous().view(count, self.maps, -1)  # (N, K, 1024)
+        logits = self.attend(h).float().contiguous().view(count, self.maps, -1)  # (N, K, S^2 / 4)
         attention = (logits + _rarity(x)).softmax(-1)
-        colors = blocks.permute(0, 2, 3, 1).reshape(count, 256, -1).float() @ (self.average / 255) - 0.5
-        colors = colors.view(count, 256, SUB**2, 3).transpose(1, 2).reshape(count, -1, 3)
+        colors = blocks.permute(0, 2, 3, 1).flatten(1, 2).float() @ (self.average / 255) - 0.5
+        colors = colors.view(count, -1, SUB**2, 3).transpose(1, 2).reshape(count, -1, 3)
         mean = colors.mean(1)
         where = attention @ torch.cat([self.places.expand(count, -1, -1), colors], -1)  # (N, K, 5)
-        of_blocks = attention.view(count, self.maps, SUB**2, -1).sum(2)  # (N, K, 256)
-        features = self.features(h).permute(0, 2, 3, 1).reshape(count, 256, -1).float()
+        of_blocks = attention.view(count, self.maps, SUB**2, -1).sum(2)  # (N, K, S^2 / 16)
+        features = self.features(h).permute(0, 2, 3, 1).flatten(1, 2).float()
         what = of_blocks @ features  # (N, K, features)
         glimpses = self.look(x.float(), where[:, : self.glimpses, :2], 255 * (mean + 0.5)) / 255
         values = 2 * where.flatten(1), what.flatten(1), 3 * mean, self.read(2 * glimpses.flatten(1))
@@ -136,7 +152,7 @@ class GlimpseEncoder(Encoder):
         return self.mlp(pooled) + self.linear(pooled)
 
     def look(self, x: torch.Tensor, centers: torch.Tensor, background: torch.Tensor) -> torch.Tensor:
-        """Read glimpses of frames ``[N, 3, 64, 64]``.
+        """Read glimpses of frames ``[N, 3, S, S]``.
 
         Args:
             x: frames.
@@ -144,13 +160,16 @@ class GlimpseEncoder(Encoder):
             background: colours ``[N, 3]`` to subtract inside the frames; outside, a glimpse is 0.
 
         Returns:
-            ``[N, G, S, 3, S]``, rows first.
+            ``[N, G, samples, 3, samples]``, rows first.
         """
-        across, down = hat_kernels(centers, self.samples, self.spacing).unbind(2)  # (N, G, S, 64)
-        rows = down.flatten(1, 2) @ x.transpose(1, 2).flatten(2)  # (N, G S, 3 * 64)
-        rows = rows.view(*centers.shape[:2], -1, 64)  # (N, G, S * 3, 64)
+        size = self.image_size
+        across, down = hat_kernels(centers, self.samples, self.spacing, size).unbind(2)  # (N, G, samples, S)
+        rows = down.flatten(1, 2) @ x.transpose(1, 2).flatten(2)  # (N, G samples, 3 S)
+        rows = rows.view(*centers.shape[:2], -1, size)  # (N, G, samples * 3, S)
         seen = (rows @ across.mT).unflatten(2, (-1, 3))
-        inside = down.sum(-1)[..., None, None] * across.sum(-1)[:, :, None, None]  # (N, G, S, 1, S)
+        inside = (
+            down.sum(-1)[..., None, None] * across.sum(-1)[:, :, None, None]
+        )  # (N, G, samples, 1, samples)
         return seen - inside * background[:, None, None, :, None]
 
 
@@ -158,7 +177,7 @@ SUB = 2  # attention maps have SUB x SUB places in a block
 
 
 def _split_blocks(maps: torch.Tensor) -> torch.Tensor:
-    """Order maps ``[N, C, 32, 32]`` by the place in a block, then by the block, ``[N, C, 1024]``."""
+    """Order maps ``[N, C, M, M]`` by the place in a block, then by the block, ``[N, C, M^2]``."""
     return F.pixel_unshuffle(maps, SUB).flatten(2).view(*maps.shape[:2], -1)
 
 
@@ -172,5 +191,5 @@ def _averages() -> torch.Tensor:
 
 @torch.no_grad()
 def _rarity(x: torch.Tensor) -> torch.Tensor:
-    """Return the logarithm of the mean rarity of the colours at the places of a map, ``[N, 1, 1024]``."""
+    """Return the logarithm of the mean rarity of the colours at the places of a map, ``[N, 1, S^2 / 4]``."""
     return _split_blocks(F.avg_pool2d(color_weights(x, 0.75)[:, None], BLOCK // SUB)).log()

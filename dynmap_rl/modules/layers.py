@@ -10,7 +10,7 @@ BLOCK = 4  # side of the blocks of pixels that encoder and decoder work on
 
 
 def to_blocks(pixels: torch.Tensor) -> torch.Tensor:
-    """Rearrange frames ``[N, 3, 64, 64]`` to blocks of 4 x 4 pixels, ``[N, 48, 16, 16]`` in channels-last memory.
+    """Rearrange frames ``[N, 3, S, S]`` to blocks of 4 x 4 pixels, ``[N, 48, S / 4, S / 4]`` in channels-last memory.
 
     A convolution on blocks equals one with four times the kernel and stride on pixels, and 48 channels fill a
     processor's vector units where 3 do not.
@@ -18,8 +18,8 @@ def to_blocks(pixels: torch.Tensor) -> torch.Tensor:
     if pixels.dtype != torch.uint8:
         return F.pixel_unshuffle(pixels, BLOCK).contiguous(memory_format=torch.channels_last)
     # Moving four adjacent bytes as one number is four times as fast.
-    rows = pixels.contiguous().view(torch.int32)  # (N, 3, 64, 16)
-    blocks = rows.unflatten(2, (-1, BLOCK)).permute(0, 2, 4, 1, 3).contiguous()  # (N, 16, 16, 3, 4)
+    rows = pixels.contiguous().view(torch.int32)  # (N, 3, S, S / 4)
+    blocks = rows.unflatten(2, (-1, BLOCK)).permute(0, 2, 4, 1, 3).contiguous()  # (N, S / 4, S / 4, 3, 4)
     return blocks.view(torch.uint8).flatten(3).permute(0, 3, 1, 2)
 
 
@@ -30,8 +30,8 @@ def make_grid(size: int) -> torch.Tensor:
     return torch.stack([x, y], -1)
 
 
-def hat_kernels(centers: torch.Tensor, count: int, spacing: float = 1.0) -> torch.Tensor:
-    """Return kernels that read or write ``count`` samples, ``spacing`` pixels apart, along an axis of 64 pixels.
+def hat_kernels(centers: torch.Tensor, count: int, spacing: float = 1.0, size: int = 64) -> torch.Tensor:
+    """Return kernels that read or write ``count`` samples, ``spacing`` pixels apart, along an axis of ``size`` pixels.
 
     A kernel is a triangle over the pixels around its sample, so that reading and writing are linear interpolation and
     have a gradient with respect to the centre. Samples outside the frame have less weight, or none.
@@ -40,13 +40,14 @@ def hat_kernels(centers: torch.Tensor, count: int, spacing: float = 1.0) -> torc
         centers: middles of the samples, ``[...]``, in -1..1 from edge to edge.
         count: number of samples.
         spacing: distance of the samples in pixels, 1 or more.
+        size: pixels of the axis.
 
     Returns:
-        ``[..., count, 64]``; the sum over the pixels is 1 inside the frame.
+        ``[..., count, size]``; the sum over the pixels is 1 inside the frame.
     """
     steps = (torch.arange(count, device=centers.device) - (count - 1) / 2) * spacing
-    pixels = torch.arange(64, device=centers.device) + 0.5
-    samples = (centers[..., None] + 1) * 32 + steps
+    pixels = torch.arange(size, device=centers.device) + 0.5
+    samples = (centers[..., None] + 1) * (size / 2) + steps
     return (1 - (pixels - samples[..., None]).abs() / spacing).clamp_min(0) / spacing
 
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import nn
 
+from .cameras import CameraDecoders, CameraEncoders
 from .decoder import DynamicsDecoder, PlainDecoder, SpriteDecoder
 from .encoder import GlimpseEncoder, PlainEncoder
 from .normalization import Normalizer
@@ -27,9 +28,11 @@ class WorldModel(nn.Module):
         hidden_size: H.
         architecture: ``plain``, the paper's plain CNNs (:class:`PlainEncoder`, :class:`PlainDecoder`), or ``glimpse``
             (:class:`GlimpseEncoder`, :class:`SpriteDecoder`).
+        image_size: side S of the frames of a camera, a multiple of 8.
+        cameras: number of cameras, whose frames stand side by side; each has an encoder and a decoder of its own.
 
     Raises:
-        ValueError: the architecture is unknown.
+        ValueError: the architecture is unknown, or the frames have another size.
     """
 
     def __init__(
@@ -39,15 +42,24 @@ class WorldModel(nn.Module):
         latent_size: int = 64,
         hidden_size: int = 128,
         architecture: str = "glimpse",
+        image_size: int = 64,
+        cameras: int = 1,
     ):
         super().__init__()
         if architecture not in ARCHITECTURES:
             raise ValueError(f"architecture must be one of {', '.join(ARCHITECTURES)}, got {architecture!r}")
+        if image_size < 8 or image_size % 8 or cameras < 1:
+            raise ValueError(
+                f"frames must have a side that is a multiple of 8 and at least one camera, got {image_size} and {cameras}"
+            )
         self.latent_size, self.hidden_size, self.architecture = latent_size, hidden_size, architecture
+        self.image_size, self.cameras = image_size, cameras
         encoder, decoder = ARCHITECTURES[architecture]
-        self.encoder = encoder(latent_size)
+        encoders = [encoder(latent_size, image_size=image_size) for _ in range(cameras)]
+        self.encoder = encoders[0] if cameras == 1 else CameraEncoders(encoders, image_size)
         self.transition = Transition(action, latent_size, hidden_size)
-        self.image_decoder = decoder(latent_size + 2 * hidden_size)
+        decoders = [decoder(latent_size + 2 * hidden_size, image_size=image_size) for _ in range(cameras)]
+        self.image_decoder = decoders[0] if cameras == 1 else CameraDecoders(decoders)
         self.dynamics_decoder = DynamicsDecoder(latent_size + 2 * hidden_size, dynamics)
 
     @property
@@ -56,7 +68,7 @@ class WorldModel(nn.Module):
         return self.dynamics_decoder.quantities
 
     def encode(self, pixels: torch.Tensor, mixed: bool = False) -> torch.Tensor:
-        """Encode frames ``[..., 3, 64, 64]`` as latents ``[..., Z]``: ``z_t = ENC(I_t)``.
+        """Encode frames ``[..., 3, S, cameras * S]`` as latents ``[..., Z]``: ``z_t = ENC(I_t)``.
 
         Args:
             pixels: frames, 0..255.
@@ -82,7 +94,7 @@ class WorldModel(nn.Module):
         return self.transition.lstm.initial_state(batch, device)
 
     def decode_pixels(self, predicted_latent, hidden1, hidden2) -> torch.Tensor:
-        """Decode predicted frames ``[..., 3, 64, 64]`` in 0..1."""
+        """Decode predicted frames ``[..., 3, S, cameras * S]`` in 0..1."""
         return self.image_decoder(predicted_latent, hidden1, hidden2)
 
     def decode_dynamics(self, predicted_latent, hidden1, hidden2) -> dict[str, torch.Tensor]:

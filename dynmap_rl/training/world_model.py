@@ -17,15 +17,21 @@ from .loop import SAVE_EVERY, fit
 from .settings import JointTraining, WorldModelArchitecture, WorldModelTraining
 
 
-def build_world_model(constants: dict, settings: WorldModelArchitecture) -> WorldModel:
+def build_world_model(
+    constants: dict, settings: WorldModelArchitecture, episodes: TensorDictBase | None = None
+) -> WorldModel:
     """Make a world model with random weights.
 
     Args:
         constants: of the dataset's normalisation, ``{name: {"low": [D], "high": [D]}}``.
         settings: form of the world model.
+        episodes: episodes with ``pixels`` ``[..., 3, S, cameras * S]``, which give the size of the frames; by default
+            one camera of 64 x 64.
     """
     supervision = parse_supervision(settings.supervision)
-    return make_world_model(constants, supervision, architecture=settings.architecture)
+    height, width = (64, 64) if episodes is None else episodes["pixels"].shape[-2:]
+    frames = {"image_size": height, "cameras": width // height}
+    return make_world_model(constants, supervision, architecture=settings.architecture, **frames)
 
 
 def train_world_model(

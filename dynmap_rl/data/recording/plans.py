@@ -185,7 +185,7 @@ def demonstrate(task: str, plans: list[Plan]) -> TensorDict:
     return torch.cat(episodes)
 
 
-def mark_pushes(plans: list[Plan], steps: int) -> torch.Tensor:
+def mark_pushes(plans: list[Plan], steps: int = EPISODE_STEPS) -> torch.Tensor:
     """Return in which of the ``steps`` steps a push acts, bool ``[E, steps, 1]``."""
     disturbed = torch.zeros(len(plans), steps, 1, dtype=torch.bool)
     for row, plan in enumerate(plans):
