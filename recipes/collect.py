@@ -19,7 +19,8 @@ from dynmap_rl.utils.cli import command_line, run_recipe
 class Config:
     """Settings of the recipe."""
 
-    # Task: balance_reaching, balance_reaching_obstacle, bin_dropping, or module:Class of your own.
+    # Task: balance_reaching, balance_reaching_obstacle, bin_dropping, mujoco:FetchPush (FetchSlide, PlateSlide, Soccer),
+    # or module:Class of your own.
     task: str = "balance_reaching"
     # demonstrations (successful episodes only) or exploration (noisy experts on detours, all episodes).
     kind: str = "demonstrations"

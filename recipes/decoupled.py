@@ -3,13 +3,14 @@
     python recipes/decoupled.py                                       # RGB+[P+V], recurrent policy
     python recipes/decoupled.py --world_model.supervision none --policy.kind feedforward
     python recipes/decoupled.py --task bin_dropping
+    python recipes/decoupled.py --task mujoco:FetchSlide --eval.episodes 500 --eval.paper_episodes 0
 
 Demonstrations are recorded with the shipped expert where they are missing. The same command resumes a stopped run, and
 prints the result of a finished one.
 """
 
 import sys
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 
@@ -23,7 +24,8 @@ from dynmap_rl.utils.devices import Compute
 class Config:
     """Settings of the recipe."""
 
-    # Task: balance_reaching, balance_reaching_obstacle, bin_dropping, or module:Class of your own.
+    # Task: balance_reaching, balance_reaching_obstacle, bin_dropping, mujoco:FetchPush (FetchSlide, PlateSlide, Soccer),
+    # or module:Class of your own.
     task: str = "balance_reaching"
     # Dataset: a folder or a hub id; by default datasets/TASK, recorded where it is missing.
     dataset: str | None = None
@@ -56,7 +58,7 @@ def main(config: Config) -> None:
     from dynmap_rl.reporting.run_page import row_text, write_report
     from dynmap_rl.runs.folder import open_run, plain_settings
     from dynmap_rl.runs.loggers import check_logger
-    from dynmap_rl.training.dataset import check_dataset, find_or_record
+    from dynmap_rl.training.dataset import check_dataset, choose_augmentation, find_or_record
     from dynmap_rl.training.decoupled import check_same, train_policies
     from dynmap_rl.training.world_model import build_world_model, train_world_model
     from dynmap_rl.utils.devices import choose_device, seed_everything
@@ -84,8 +86,10 @@ def main(config: Config) -> None:
     episodes, constants = load_demonstrations(dataset)
     if world_model is None:
         seed_everything(config.world_model.seed)
-        world_model = build_world_model(constants, config.world_model).to(device)
-        train_world_model(world_model, episodes, folder, config.world_model, logger=config.logger)
+        world_model = build_world_model(constants, config.world_model, episodes["train"]).to(device)
+        augmentation = choose_augmentation(task, config.world_model.augmentation)
+        settings, by_entry = replace(config.world_model, augmentation=augmentation), not task.planar
+        train_world_model(world_model, episodes, folder, settings, logger=config.logger, by_entry=by_entry)
     judge = partial(judge_in_closed_loop, task=config.task, settings=config.eval)
     fingerprint = train_policies(
         world_model, episodes, constants, folder, config.policy,

@@ -23,7 +23,8 @@ from dynmap_rl.utils.devices import Compute
 class Config:
     """Settings of the recipe."""
 
-    # Task: balance_reaching, balance_reaching_obstacle, bin_dropping, or module:Class of your own.
+    # Task: balance_reaching, balance_reaching_obstacle, bin_dropping, mujoco:FetchPush (FetchSlide, PlateSlide, Soccer),
+    # or module:Class of your own.
     task: str = "balance_reaching"
     # Dataset: a folder or a hub id; by default datasets/TASK, recorded where it is missing.
     dataset: str | None = None
@@ -52,7 +53,7 @@ def main(config: Config) -> None:
     from dynmap_rl.reporting.run_page import row_text, write_report
     from dynmap_rl.runs.folder import open_run, plain_settings
     from dynmap_rl.runs.loggers import check_logger
-    from dynmap_rl.training.dataset import check_dataset, find_or_record
+    from dynmap_rl.training.dataset import check_dataset, choose_augmentation, find_or_record
     from dynmap_rl.training.joint import train_seeds
     from dynmap_rl.utils.devices import choose_device
     from dynmap_rl.utils.files import read_json
@@ -73,6 +74,7 @@ def main(config: Config) -> None:
     augmentation = config.training.augmentation
     if not task.symmetric:  # the policy learns from the changed windows too
         augmentation = replace(augmentation, mirror=False, max_shift=0)
+    augmentation = choose_augmentation(task, augmentation)
     world_model = train_seeds(
         partial(load_demonstrations, dataset), folder,
         WorldModelArchitecture("none"), config.policy, replace(config.training, augmentation=augmentation),

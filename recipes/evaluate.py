@@ -32,7 +32,8 @@ class Config:
     trust_remote_code: bool = False
     # Seed of the run's policy.
     seed: int = 0
-    # Task: balance_reaching, ..., or module:Class of your own; by default that of the run, else balance_reaching.
+    # Task: balance_reaching, ..., mujoco:FetchPush, ..., or module:Class of your own; by default that of the run, else
+    # balance_reaching.
     task: str | None = None
     # Delay of the frames in control steps of 50 ms. The world model imagines the steps up to the present.
     delay: int = 0

@@ -48,6 +48,7 @@ def main(config: Config) -> None:
     import torch
 
     from dynmap_rl.data.demonstrations import load_demonstrations
+    from dynmap_rl.envs.task import Task
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.evaluation.protocol import judge_in_closed_loop
     from dynmap_rl.paper.published import paper_numbers
@@ -60,7 +61,7 @@ def main(config: Config) -> None:
     from dynmap_rl.utils.devices import choose_device
     from dynmap_rl.utils.files import read_json
 
-    task, seeds = get_task(config.task), parse_seeds(config.seeds)
+    task, seeds = get_task(config.task, kind=Task), parse_seeds(config.seeds)
     choose_device(config.compute.device)
     check_logger(config.logger)
     if config.dataset:

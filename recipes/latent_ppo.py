@@ -41,6 +41,7 @@ def main(config: Config) -> None:
     """Train, judge and report."""
     import torch
 
+    from dynmap_rl.envs.task import Task
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.envs.world import ACCELERATION_LIMIT
     from dynmap_rl.evaluation.experts import fresh_scenes, rates
@@ -61,7 +62,7 @@ def main(config: Config) -> None:
     if config.threads < 1 or config.hidden < 1:
         raise ValueError("--threads and --hidden must be at least 1")
     check_logger(config.logger)
-    task, ppo = get_task(config.task), config.ppo
+    task, ppo = get_task(config.task, kind=Task), config.ppo
     world_model, source = load_source(config.pretrained)
     world_model.requires_grad_(False)
     expert = experts.load_expert(config.expert or config.task)

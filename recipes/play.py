@@ -57,6 +57,7 @@ def main(config: Config) -> None:
     """Play, record and upload."""
     from dynmap_rl.data.format.hub import push_dataset
     from dynmap_rl.data.recording.human import list_shards, next_scene, open_folder, publish_episodes
+    from dynmap_rl.envs.task import Task
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.envs.world import CONTROL_DT, EPISODE_STEPS
     from dynmap_rl.play.session import MAX_DELAY, Session
@@ -68,7 +69,7 @@ def main(config: Config) -> None:
     run = find_run(config.policy) if config.policy else None
     task = config.task or (run and task_of_run(run)) or "balance_reaching"
     actor = load_actor(run, config.seed) if run else None
-    get_task(task, from_file=not config.task)
+    get_task(task, from_file=not config.task, kind=Task)
     if config.size < 64 or (config.steps is not None and config.steps < 1):
         raise ValueError(
             f"--size must be at least 64 and --steps at least 1, got {config.size} and {config.steps}"

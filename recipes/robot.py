@@ -38,8 +38,10 @@ class Config:
 
     # Dataset: a folder or a hub id. Required.
     dataset: str | None = None
-    # Camera's column; by default the first camera.
+    # Camera's column, or several with commas between; by default the first camera.
     camera: str | None = None
+    # Side of the frames of a camera in pixels, a multiple of 8; frames are resized.
+    image_size: int = 64
     # Goal's column and entries, such as observation.state:3,4; by default no goal.
     goal: str | None = None
     # decoupled (world model first, then policies on its states) or joint (one loss).
@@ -90,7 +92,7 @@ def main(config: Config) -> None:
 
     torch.set_num_threads(config.compute.threads)
     steps = (config.joint if config.method == "joint" else config.world_model).window_steps
-    load = partial(load_robot_dataset, config.dataset, steps, config.camera, config.goal)
+    load = partial(load_robot_dataset, config.dataset, steps, config.camera, config.goal, config.image_size)
     judge, fingerprint = partial(judge_held_out, load=load), None
     episodes, constants = load()
     common = {"judge": judge, "seeds": seeds, "compute": config.compute, "logger": config.logger}
@@ -99,7 +101,7 @@ def main(config: Config) -> None:
         world_model = train_seeds(load, folder, *parts, by_entry=True, **common)
     else:
         seed_everything(config.world_model.seed)
-        world_model = build_world_model(constants, config.world_model).to(device)
+        world_model = build_world_model(constants, config.world_model, episodes["train"]).to(device)
         settings = config.world_model
         train_world_model(world_model, episodes, folder, settings, logger=config.logger, by_entry=True)
         fingerprint = train_policies(world_model, episodes, constants, folder, config.policy, **common)
@@ -118,6 +120,8 @@ def check_config(config: Config) -> None:
         raise ValueError("--dataset must be a folder or a hub id; name the dataset to train on")
     if config.method not in ("decoupled", "joint"):
         raise ValueError(f"--method must be decoupled or joint, got {config.method!r}")
+    if config.image_size < 8 or config.image_size % 8:
+        raise ValueError(f"--image_size must be a multiple of 8, got {config.image_size}")
 
     def own(settings: type, base: type) -> list[str]:
         return [field.name for field in fields(settings) if field.name not in {f.name for f in fields(base)}]

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from dynmap_rl.keys import DYNAMICS, FRAME_SHAPE
+from dynmap_rl.keys import DYNAMICS
 
 from .derive import entry_names, parse_entries
 from .format.frames import choose_camera, iterate_frames
@@ -29,12 +29,12 @@ def describe_robot_dataset(
 
     Args:
         dataset: local folder or hub id.
-        camera: column of the frames; by default the first camera.
+        camera: column of the frames, or several with commas between; by default the first camera.
         goal: ``COLUMN:ENTRIES``, such as ``observation.state:3,4``; by default no goal.
         supervision: quantities of the dynamics whose columns must exist.
 
     Returns:
-        ``root``, ``info`` (content of ``meta/info.json``), ``camera``, ``goal`` (column and entries, or None), and
+        ``root``, ``info`` (content of ``meta/info.json``), ``cameras``, ``goal`` (column and entries, or None), and
         ``names``: the names of the entries of ``action`` and of every dynamics quantity that the dataset has.
 
     Raises:
@@ -54,18 +54,23 @@ def describe_robot_dataset(
     return {
         "root": root,
         "info": info,
-        "camera": choose_camera(root, info, camera),
+        "cameras": [choose_camera(root, info, name) for name in (camera.split(",") if camera else [None])],
         "goal": _check_goal(root, info, goal),
         "names": {key: entry_names(info, column) for key, column in columns.items()},
     }
 
 
 def load_robot_dataset(
-    dataset: str | Path, min_steps: int, camera: str | None = None, goal: str | None = None
+    dataset: str | Path,
+    min_steps: int,
+    camera: str | None = None,
+    goal: str | None = None,
+    image_size: int = 64,
 ) -> tuple[dict[str, TensorDict], dict]:
     """Load training and held-out pieces of any LeRobot v3.0 dataset, with constants of normalisation.
 
-    Frames are resized to 64 x 64 with ``cv2.INTER_AREA``, whatever their aspect. Episodes shorter than ``min_steps``
+    Frames are resized to S x S with ``cv2.INTER_AREA``, whatever their aspect; those of several cameras stand side by
+    side. Episodes shorter than ``min_steps``
     are left out. The others are cut into pieces of T steps, T being the length of the shortest episode, at most 120.
     As many pieces as needed cover an episode, evenly spread; they overlap where T does not divide its length. No piece
     crosses the border of an episode. Splits named ``train`` and ``eval`` are kept; otherwise every tenth episode is
@@ -74,12 +79,13 @@ def load_robot_dataset(
     Args:
         dataset: local folder or hub id.
         min_steps: steps of the windows that will be drawn.
-        camera: column of the frames; by default the first camera.
+        camera: column of the frames, or several with commas between; by default the first camera.
         goal: ``COLUMN:ENTRIES``, such as ``observation.state:3,4``; by default no goal.
+        image_size: S, a multiple of 8.
 
     Returns:
         The pieces by split, ``train`` and ``eval``, and the constants (``low`` and ``high`` ``[D]`` of action, goal and
-        every quantity of the dynamics). Pieces are ``[P, T]``: ``pixels`` uint8 ``[P, T, 3, 64, 64]``, ``action``
+        every quantity of the dynamics). Pieces are ``[P, T]``: ``pixels`` uint8 ``[P, T, 3, S, cameras * S]``, ``action``
         ``[P, T, A]``, ``goal`` ``[P, T, G]`` (G = 0 without a goal), ``("dynamics", quantity)`` ``[P, T, D]`` for the
         columns that the dataset has, float32 in its units, ``disturbed`` bool ``[P, T, 1]`` where the dataset has such a
         column of flags, and ``episode`` int64 ``[P, T, 1]``, the episode's index.
@@ -94,8 +100,10 @@ def load_robot_dataset(
     splits = choose_splits(root, info, list(lengths))
     steps = min(LONGEST, *lengths.values())
     parts = {name: [] for name in splits}
-    height, width, _ = FRAME_SHAPE
-    for episode, frames, _ in iterate_frames(root, info, layout["camera"], size=(width, height)):
+    size = image_size, image_size
+    sources = [iterate_frames(root, info, name, size=size) for name in layout["cameras"]]
+    for views in zip(*sources, strict=True):
+        episode, frames = views[0][0], np.concatenate([frames for _, frames, _ in views], 2)
         for name in (name for name, members in splits.items() if episode in members):
             own = {key: values[rows[episode]] for key, values in numbers.items()}
             own["pixels"] = torch.from_numpy(frames).permute(0, 3, 1, 2)

@@ -10,6 +10,8 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 
+from dynmap_rl.envs.protocol import Layout
+from dynmap_rl.envs.task import LAYOUT
 from dynmap_rl.envs.tasks import REST_SPEED
 from dynmap_rl.envs.world import CONTROL_DT
 from dynmap_rl.evaluation.probing import STATES
@@ -34,21 +36,42 @@ def predict(world_model: WorldModel, episodes: TensorDictBase) -> TensorDictBase
 
 
 def plot_reconstruction(
-    world_model: WorldModel, episodes: TensorDictBase, path: Path, steps=(1, 8, 16, 24, 60, 110)
+    world_model: WorldModel,
+    episodes: TensorDictBase,
+    path: Path,
+    steps=(1, 8, 16, 24, 60, 110),
+    dt: float = CONTROL_DT,
 ) -> None:
-    """Draw frames of episodes ``[E, T]`` and their predictions from the frame before: two rows an episode."""
+    """Draw frames of episodes ``[E, T]`` and their predictions from the frame before: two rows an episode.
+
+    Args:
+        world_model: world model that predicts.
+        episodes: episodes to draw.
+        path: file to write.
+        steps: steps to draw, of which those within the episodes are drawn.
+        dt: duration of a step (s).
+    """
     steps = [t for t in steps if t < episodes.shape[1]]
     figure = plt.figure(figsize=(1.3 * len(steps), 2.7 * len(episodes)))
-    draw_reconstruction(figure, predict(world_model, episodes), [steps] * len(episodes))
+    draw_reconstruction(figure, predict(world_model, episodes), [steps] * len(episodes), dt)
     save_figure(figure, path)
 
 
-def plot_dynamics(world_model: WorldModel, episode: TensorDictBase, path: Path) -> None:
-    """Draw the block's true and predicted dynamics along one episode ``[T]``; nothing for an Only-RGB model."""
+def plot_dynamics(
+    world_model: WorldModel, episode: TensorDictBase, path: Path, layout: Layout = LAYOUT
+) -> None:
+    """Draw true and predicted dynamics along one episode ``[T]``; nothing for an Only-RGB model.
+
+    Args:
+        world_model: world model that predicts.
+        episode: one episode.
+        path: file to write.
+        layout: sizes and names of the task; of cart and block, the block is drawn, otherwise the first body.
+    """
     if not world_model.supervision:
         return
     figure = plt.figure(figsize=(9, 2.2 * len(world_model.supervision)))
-    draw_dynamics(figure, predict(world_model, episode[None])[0], world_model.supervision)
+    draw_dynamics(figure, predict(world_model, episode[None])[0], world_model.supervision, layout)
     save_figure(figure, path)
 
 
@@ -101,7 +124,7 @@ def plot_perception(
     save_figure(figure, path)
 
 
-def draw_reconstruction(figure, out: TensorDictBase, steps: list[list[int]]) -> None:
+def draw_reconstruction(figure, out: TensorDictBase, steps: list[list[int]], dt: float = CONTROL_DT) -> None:
     """Draw frames of episodes ``[E, T]`` (see :func:`predict`) and their predictions at the ``steps`` of each."""
     axes = figure.subplots(2 * len(out), len(steps[0]), squeeze=False)
     for row, episode in enumerate(out):
@@ -111,24 +134,26 @@ def draw_reconstruction(figure, out: TensorDictBase, steps: list[list[int]]) -> 
             axes[2 * row, column].imshow(truth[t])
             axes[2 * row + 1, column].imshow(guess[t])
             if row == 0 or steps[row] != steps[row - 1]:
-                axes[2 * row, column].set_title(f"{t * CONTROL_DT:.2f} s", fontsize=9)
+                axes[2 * row, column].set_title(f"{t * dt:.2f} s", fontsize=9)
         axes[2 * row, 0].set_ylabel("true", fontsize=9)
         axes[2 * row + 1, 0].set_ylabel("predicted", fontsize=9)
     for axis in axes.flat:
         axis.set(xticks=[], yticks=[])
 
 
-def draw_dynamics(figure, out: TensorDictBase, supervision: tuple[str, ...]) -> None:
-    """Draw the block's dynamics along one episode ``[T]`` (see :func:`predict`), a row for each quantity."""
+def draw_dynamics(figure, out: TensorDictBase, supervision: tuple[str, ...], layout: Layout = LAYOUT) -> None:
+    """Draw the dynamics of a body along one episode ``[T]`` (see :func:`predict`), a row for each quantity."""
     axes = figure.subplots(len(supervision), 3, squeeze=False, sharex=True)
-    time = np.arange(out.shape[0]) * CONTROL_DT
+    time, first = np.arange(out.shape[0]) * layout.dt, 3 if layout == LAYOUT else 0
     for row, quantity in enumerate(supervision):
-        for column, component in enumerate(COMPONENTS):
-            axis, index = axes[row, column], 3 + column
+        for column in range(3):
+            axis, index = axes[row, column], first + column
+            body, _, component = layout.dynamics[quantity][index].rpartition("_")
+            unit = UNITS[quantity][2 if component == "theta" else 0]
             axis.plot(time, out["dynamics", quantity][:, index], "k", lw=1, label="true")
             predicted = out["predicted_dynamics", quantity][1:, index]
             axis.plot(time[1:], predicted, "tab:green", lw=1, label="predicted")
-            axis.set_title(f"block {quantity} {component} [{UNITS[quantity][column]}]", fontsize=8)
+            axis.set_title(f"{body} {quantity} {component} [{unit}]", fontsize=8)
             axis.tick_params(labelsize=7)
     for axis in axes[-1]:
         axis.set_xlabel("time [s]", fontsize=8)

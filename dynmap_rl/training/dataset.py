@@ -7,6 +7,8 @@ from pathlib import Path
 from dynmap_rl.data.demonstrations import META, find_meta
 from dynmap_rl.data.format.reading import find_dataset
 from dynmap_rl.data.recording.record import record_dataset
+from dynmap_rl.data.settings import Augmentation
+from dynmap_rl.envs.protocol import BaseTask
 from dynmap_rl.envs.tasks import get_task
 
 
@@ -27,6 +29,11 @@ def find_or_record(task: str, dataset: str | Path | None = None) -> str | Path:
     dataset = folder if dataset is None else dataset
     check_dataset(dataset, task)
     return dataset
+
+
+def choose_augmentation(task: BaseTask, augmentation: Augmentation) -> Augmentation:
+    """Return the augmentation for windows of a task: none where frames are no flat pictures of the plane."""
+    return augmentation if task.planar else Augmentation.off()
 
 
 def check_dataset(dataset: str | Path, task: str) -> None:

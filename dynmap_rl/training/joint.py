@@ -176,7 +176,7 @@ def _train_and_evaluate(arguments: tuple[_Work, int]) -> None:
     seed_everything(2000 + seed)
     episodes, constants = work.load()
     device = choose_device(work.device)
-    world_model = build_world_model(constants, work.world_model).to(device)
+    world_model = build_world_model(constants, work.world_model, episodes["train"]).to(device)
     policy = make_policy(constants, work.policy.kind, world_model).to(device)
     folder = work.folder / f"seed_{seed}"
     common = {"seed": seed, "logger": work.logger}

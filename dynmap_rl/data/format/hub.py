@@ -60,10 +60,15 @@ def push_dataset(root: str | Path, repo_id: str) -> None:
         repo_id: id on the hub (``user/name``).
 
     Raises:
-        ValueError: the folder is not a recording.
+        ValueError: the folder is not a recording of a task of cart and block.
         OSError: the hub refuses the upload or cannot be reached.
     """
     meta = load_meta(root)
+    if "layout" in meta:
+        raise ValueError(
+            f"{root} must be a recording of cart and block, whose card is written here, got {meta['task']}; upload it "
+            "with LeRobotDataset.push_to_hub"
+        )
     with quiet():
         from huggingface_hub import HfApi
         from lerobot.datasets import LeRobotDataset
