@@ -87,8 +87,8 @@ class BodyReader:
         return np.concatenate(position), np.concatenate(velocity)
 
 
-POSES = {
-    mujoco.mjtObj.mjOBJ_BODY: lambda data, i: (data.xpos[i], data.xmat[i]),
+POSES = {  # XBODY is a body's own frame; BODY would be the frame of its centre of mass
+    mujoco.mjtObj.mjOBJ_XBODY: lambda data, i: (data.xpos[i], data.xmat[i]),
     mujoco.mjtObj.mjOBJ_GEOM: lambda data, i: (data.geom_xpos[i], data.geom_xmat[i]),
     mujoco.mjtObj.mjOBJ_SITE: lambda data, i: (data.site_xpos[i], data.site_xmat[i]),
 }

@@ -1,0 +1,147 @@
+"""A Gymnasium environment with MuJoCo as a task: one of one's own, and those of the benchmarks."""
+
+import numpy as np
+import pytest
+import torch
+from own_task import check_renderer, own_task, read_code  # noqa: F401
+from torchrl.envs.utils import check_env_specs
+
+from dynmap_rl.envs.protocol import Layout
+from dynmap_rl.envs.tasks import get_task
+from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
+
+KEYS = "pixels", "agent_pos", "goal", "state", "dynamics", ("next", "reward")
+BENCHMARKS = "FetchPush", "FetchSlide", "PlateSlide", "Soccer"
+
+
+def roll(task, seeds, steps=12, **arguments):
+    env = DynmapBatchedEnv(task, len(seeds), from_pixels=True, **arguments)
+    td, out = env.reset(scene_seed=torch.tensor(seeds)), []
+    for t in range(steps):
+        action = 0.8 * torch.ones_like(env.action_spec.zero()) * (t > 2)
+        td = env.step(td.set("action", action))
+        out.append(td.select(*KEYS))
+        td = td["next"]
+    return env, torch.stack(out, 1)
+
+
+def test_a_task_takes_fewer_than_60_lines():
+    assert len(read_code().splitlines()) < 60
+
+
+def test_the_environment_has_the_sizes_of_the_layout(own_task):  # noqa: F811
+    env = DynmapBatchedEnv(own_task, 2, from_pixels=True, seed=0)
+    check_env_specs(env)
+    layout = env.layout
+    assert layout == Layout.from_dict(layout.to_dict())
+    assert layout.position[:3] == ("puck_x", "puck_y", "puck_z") and len(layout.position) == 9
+    assert env.observation_spec["dynamics", "velocity"].shape == (2, len(layout.velocity))
+    assert env.observation_spec["goal"].shape == (2, 3)
+    with pytest.raises(ValueError, match="finite"):
+        env.step(env.reset().set("action", torch.full((2, 1), torch.nan)))
+
+
+def test_an_episode_depends_on_its_seed_alone(own_task):  # noqa: F811
+    _, pair = roll(own_task, [3, 4])
+    env, single = roll(own_task, [4])
+    assert (pair[1:] == single).all()
+    assert not torch.equal(pair[0, 0]["goal"], pair[1, 0]["goal"])
+    again = env.reset(scene_seed=torch.tensor([4]))  # in a used simulator
+    assert (again.select(*KEYS[:-1]) == single[:, 0].select(*KEYS[:-1])).all()
+
+
+def test_dynamics_agree_with_each_other(own_task):  # noqa: F811
+    env, out = roll(own_task, [0], steps=20)
+    position, velocity, acceleration = (
+        out["dynamics", q][0].double() for q in ("position", "velocity", "acceleration")
+    )
+    moved = position[1:, :3] - position[:-1, :3]
+    assert moved[:, 0].max() > 0.01
+    mean = (velocity[1:, :3] + velocity[:-1, :3]) / 2 * env.layout.dt
+    assert (moved - mean).abs().mean() < 0.15 * moved.abs().max()
+    assert (acceleration[0] == 0).all()
+    torch.testing.assert_close(
+        acceleration[1:], (velocity[1:] - velocity[:-1]) / env.layout.dt, rtol=1e-3, atol=1e-3
+    )
+
+
+def test_the_demonstrator_succeeds(own_task):  # noqa: F811
+    task = get_task(own_task)
+    world = task.begin(0)
+    act = task.demonstrator(world)
+    for _ in range(task.layout.steps):
+        assert not task.is_over(world)
+        task.step([world], [act()])
+    assert task.is_success(world) and task.distance(world) == world.position_error < 0.06
+
+
+def test_arguments_are_a_part_of_the_name(own_task):  # noqa: F811
+    task = get_task(f"{own_task}:image_size=96,cameras=2")
+    assert task.name == "push_image_size_96_cameras_2" and get_task(own_task).name == "push"
+    assert task.layout.cameras == ("front", "top") and task.layout.frame_shape == (3, 96, 192)
+    frame = task.make_renderer()(task.begin(0))
+    assert frame.shape == (96, 192, 3)
+    large = get_task(f"{own_task}:image_size=96")
+    assert (large.make_renderer()(large.begin(0)) == frame[:, :96]).all()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("image_size=65", "image_size must be one of"),
+        ("cameras=3", "cameras must be 1 to 2"),
+        ("color=1", "arguments of the task"),
+        ("image_size=__import__('os')", "arguments of the task"),
+    ],
+)
+def test_wrong_arguments_are_refused(own_task, arguments, message):  # noqa: F811
+    with pytest.raises(ValueError, match=message):
+        get_task(f"{own_task}:{arguments}")
+
+
+def test_what_is_for_cart_and_block_is_refused(own_task):  # noqa: F811
+    with pytest.raises(ValueError, match="must be a Task here"):
+        DynmapBatchedEnv(own_task, 1, control="acceleration")
+    with pytest.raises(ValueError, match="without ranges"):
+        DynmapBatchedEnv(own_task, 1, ranges=get_task("balance_reaching").ranges)
+
+
+def test_an_environment_that_does_not_fit_is_refused(own_task, monkeypatch):  # noqa: F811
+    task = get_task(own_task)
+    monkeypatch.setattr(type(task), "action", ("x", "y"))
+    with pytest.raises(ValueError, match="actions of 2 entries"):
+        task.begin(0)
+    monkeypatch.setattr(type(task), "action", ("x",))
+    monkeypatch.setattr(type(task), "is_solved", lambda self, world: True)
+    with pytest.raises(ValueError, match="starts that are not solved"):
+        task.begin(0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", BENCHMARKS)
+def test_the_experts_of_the_benchmarks_succeed(name):
+    check_renderer()
+    pytest.importorskip("gymnasium_robotics" if "Fetch" in name else "metaworld")
+    task = get_task(f"mujoco:{name}")
+    draw, world, solved = task.make_renderer(), None, 0
+    for seed in range(6):
+        world = task.begin(seed, None, world)
+        assert not task.is_success(world) and world.position_error > 0.05
+        first, act = draw(world), task.demonstrator(world)
+        for _ in range(task.layout.steps):
+            action = act()
+            assert np.abs(action).max() <= 1
+            task.step([world], [action])
+        solved += task.is_success(world)
+        assert not world.dropped and (draw(world) != first).any()
+    assert solved >= 4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", BENCHMARKS)
+def test_the_benchmarks_repeat_bit_by_bit(name):
+    check_renderer()
+    pytest.importorskip("gymnasium_robotics" if "Fetch" in name else "metaworld")
+    _, both = roll(f"mujoco:{name}", [11, 12])
+    _, last = roll(f"mujoco:{name}", [12])
+    assert (both[1:] == last).all()
