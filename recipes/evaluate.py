@@ -167,22 +167,26 @@ def load_policy(config: Config, folder: Path, instruction: str):
 def judge_expert(config: Config) -> tuple[Path, str, dict]:
     """Return the folder with an animation, the numbers as text, and the result: ``rates`` and ``intervals`` (%)."""
     from dynmap_rl.envs.tasks import get_task
-    from dynmap_rl.evaluation.experts import list_outcomes
+    from dynmap_rl.evaluation.experts import judge_demonstrator, list_outcomes
     from dynmap_rl.evaluation.rollout import failures_first, scene_seeds
     from dynmap_rl.evaluation.statistics import wilson
     from dynmap_rl.experts.careless import CarelessController
     from dynmap_rl.experts.network import list_checkpoints, load_expert, roll_out, task_of_expert
-    from dynmap_rl.reporting.media import film
+    from dynmap_rl.reporting.media import film, film_demonstrator
 
     task = get_task(config.task or "balance_reaching")
-    expert = config.expert or task.name
-    if expert == "careless":
+    expert = config.expert or ("scripted" if task.is_scripted else task.name)
+    seeds = scene_seeds(config.eval.split, config.eval.episodes)
+    if task.is_scripted:
+        refuse(config, Config(), ["expert", "checkpoint"], f"{config.task}, which has an expert of its own")
+        checkpoint, outcomes = "demonstrator", judge_demonstrator(task, seeds)
+    elif expert == "careless":
         checkpoint, network, trained_on = "baseline", CarelessController(task), task
     else:
         checkpoint = config.checkpoint or list_checkpoints(expert)[-1]
         network, trained_on = load_expert(expert, checkpoint), task_of_expert(expert, task)
-    seeds = scene_seeds(config.eval.split, config.eval.episodes)
-    outcomes = list_outcomes(task, roll_out(network, task, seeds, states=trained_on))
+    if not task.is_scripted:
+        outcomes = list_outcomes(task, roll_out(network, task, seeds, states=trained_on))
     rates = {name: 100 * sum(values) / len(seeds) for name, values in outcomes.items()}
     intervals = {name: wilson(sum(values), len(seeds)) for name, values in outcomes.items()}
     lines = [
@@ -191,7 +195,10 @@ def judge_expert(config: Config) -> tuple[Path, str, dict]:
     ]
     folder = name_folder(config, task.name, *Path(expert).parts[-4:], checkpoint)
     some = failures_first(seeds, outcomes["success"])
-    film(network, task, some, folder / "rollouts.gif", states=trained_on)
+    if task.is_scripted:
+        film_demonstrator(config.task, some, folder / "rollouts.gif")
+    else:
+        film(network, task, some, folder / "rollouts.gif", states=trained_on)
     result = {"task": config.task or task.name, "expert": expert, "checkpoint": checkpoint}
     return folder, "\n".join(lines), result | {"rates": rates, "intervals": intervals}
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from dynmap_rl.envs.geometry import path_is_blocked, way_from_start
+from dynmap_rl.envs.protocol import BaseTask
 from dynmap_rl.envs.scene import ObstacleScene, scene_seed
 from dynmap_rl.envs.task import Task
 from dynmap_rl.envs.world import World
@@ -51,6 +52,27 @@ def list_outcomes(task: Task, worlds: list[World]) -> dict[str, list[bool]]:
     if issubclass(task.ranges.scene, ObstacleScene):
         outcomes["straight_path_blocked"] = [path_is_blocked(world.scene) for world in worlds]
         outcomes["way_leads_around"] = [len(way_from_start(world.scene)) > 2 for world in worlds]
+    return outcomes
+
+
+def judge_demonstrator(task: BaseTask, seeds: Iterable[int]) -> dict[str, list[bool]]:
+    """Run the demonstrator of a task, without frames and noise.
+
+    Args:
+        task: task with a demonstrator.
+        seeds: seeds of the scenes.
+
+    Returns:
+        ``success`` and ``dropped`` at the end of the episode of each scene.
+    """
+    world, outcomes = None, {"success": [], "dropped": []}
+    for seed in seeds:
+        world = task.begin(seed, world=world)
+        act = task.demonstrator(world)
+        for _ in range(task.layout.steps):
+            task.step([world], [act()])
+        outcomes["success"].append(task.is_success(world))
+        outcomes["dropped"].append(world.dropped)
     return outcomes
 
 

@@ -10,6 +10,7 @@ import torch
 from PIL import Image
 from tensordict.nn import TensorDictModuleBase
 
+from dynmap_rl.data.recording.plans import SCRIPTED, Plan, demonstrate
 from dynmap_rl.envs.delay import FrameDelay
 from dynmap_rl.envs.renderer import Renderer
 from dynmap_rl.envs.task import Task
@@ -56,6 +57,18 @@ def film(
     steps = play(network, task, scene_seeds, states)
     frames = np.stack([[renderer.draw(world, task) for world in worlds] for worlds in steps], 1)
     save_gif(torch.from_numpy(frames).permute(0, 1, 4, 2, 3), path)
+
+
+def film_demonstrator(task: str, scene_seeds: Sequence[int], path: Path) -> None:
+    """Write episodes of a task's demonstrator as an animation.
+
+    Args:
+        task: name of the task.
+        scene_seeds: seeds of the scenes, an episode each.
+        path: file to write.
+    """
+    plans = [Plan(seed, SCRIPTED) for seed in scene_seeds]
+    save_gif(demonstrate(task, plans)["pixels"], path)
 
 
 def film_policy(

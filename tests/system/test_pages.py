@@ -129,6 +129,8 @@ def test_python_snippets_run(page, recording, tmp_path, monkeypatch):
     """In the order of the page, where a dataset has been recorded."""
     if "lerobot" in page:
         pytest.importorskip("accelerate")
+    if "mujoco" in page:
+        pytest.importorskip("mujoco")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "datasets").mkdir()
     (tmp_path / "datasets/balance_reaching").symlink_to(recording, target_is_directory=True)
