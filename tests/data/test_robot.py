@@ -99,6 +99,18 @@ def test_frames_are_resized_by_area_and_keep_their_colours(splits):
     assert abs((x + 0.5) / 64 - position[0]) < 0.03 and abs((y + 0.5) / 64 - position[1]) < 0.03
 
 
+def test_frames_of_several_cameras_and_another_size_stand_side_by_side(folders, splits):
+    both = f"{CAMERA},{CAMERA}"
+    train = load_robot_dataset(folders / "dynamics", 20, both, image_size=32)[0]["train"]
+    assert train["pixels"].shape[2:] == (3, 32, 64)
+    left, right = train["pixels"].split(32, -1)
+    assert torch.equal(left, right)
+    reduced = torch.nn.functional.avg_pool2d(splits["train"]["pixels"][0].float(), 2)
+    assert (reduced - left[0]).abs().mean() < 4
+    with pytest.raises(ValueError, match="--camera must be one of"):
+        load_robot_dataset(folders / "dynamics", 20, f"{CAMERA},front")
+
+
 def test_videos_give_nearly_the_frames_of_images(folders, splits):
     videos = load_robot_dataset(folders / "dynamics_videos", 20)[0]["train"]
     assert (videos["pixels"].float() - splits["train"]["pixels"]).abs().mean() < 2
