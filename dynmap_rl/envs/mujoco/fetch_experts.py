@@ -111,45 +111,51 @@ class StrikeExpert:
         rng, state = np.random.default_rng(0), np.empty(mujoco.mj_stateSize(self.world.model, STATE))
         mujoco.mj_getState(self.world.model, self.world.data, state, STATE)
         far, bias, final = float(np.linalg.norm(self.goal - puck)), np.zeros(2), (np.inf, [])
-
-        def improve(speed: float, offset: float, moved: np.ndarray, share: float) -> tuple[float, float]:
-            """Correct a strike that moved the puck by ``moved``: its range grows with the speed, its angle with the offset."""
-            turn = np.arctan2(way[0] * moved[1] - way[1] * moved[0], way @ moved)
-            faster = (far / max(float(np.linalg.norm(moved)), 0.05)) ** (0.6 * share)
-            return float(np.clip(speed * faster, 0.15, 1.3)), float(
-                np.clip(offset + share * turn / self.SIDEWAYS, -0.04, 0.04)
-            )
-
-        speed, offset = float(np.clip(0.25 + far, 0.3, 1.2)), 0.0
+        strike = float(np.clip(0.25 + far, 0.3, 1.2)), 0.0  # speed (1.25 m/s) and offset (m)
         for _ in range(self.ROUNDS):
             best = (np.inf,)
             for trial in range(self.TRIALS):
-                actions = self._strike(way, speed, offset)
+                actions = self._strike(way, *strike)
                 rest = self._try(state, actions) + bias
                 if (error := float(np.linalg.norm(rest - self.goal))) < best[0]:
-                    best = error, speed, offset, rest, actions
+                    best = error, strike, rest, actions
                 if error < self.CLOSE:
                     break
                 if trial < 4:
-                    speed, offset = improve(
-                        speed, offset, rest - puck, 1.0 if trial < 2 else rng.uniform(0.3, 1.2)
-                    )
-                else:
-                    speed, offset = improve(*best[1:3], best[3] - puck, rng.uniform(0.3, 1.2))
-                    speed, offset = (
-                        speed + 0.03 * rng.standard_normal(),
-                        offset + 0.003 * rng.standard_normal(),
-                    )
-            _, speed, offset, expected, actions = best
+                    share = 1.0 if trial < 2 else rng.uniform(0.3, 1.2)
+                    strike = self._improve(strike, rest - puck, way, far, share)
+                else:  # around the best, at random: what a strike does is not quite smooth
+                    strike = self._improve(best[1], best[2] - puck, way, far, rng.uniform(0.3, 1.2))
+                    strike = tuple(np.array(strike) + (0.03, 0.003) * rng.standard_normal(2))
+            _, strike, expected, actions = best
             rest = self._try(state, actions, to_the_end=True)
             if (error := float(np.linalg.norm(rest - self.goal))) < final[0]:
                 final = error, actions
             if error < self.ENOUGH:
                 break
             bias += rest - expected
-            speed, offset = improve(speed, offset, rest - puck, 1.0)
+            strike = self._improve(strike, rest - puck, way, far, 1.0)
         self._restore(state)
         return final[1]
+
+    def _improve(
+        self, strike: tuple[float, float], moved: np.ndarray, way: np.ndarray, far: float, share: float
+    ) -> tuple[float, float]:
+        """Return speed and offset, corrected by a share of the error of a strike.
+
+        The range grows with the speed, and the puck's way turns with the offset.
+
+        Args:
+            strike: speed and offset.
+            moved: how far the strike moved the puck, ``[2]`` (m).
+            way: direction to the goal, ``[2]``.
+            far: distance to the goal (m).
+            share: 1 is the whole correction.
+        """
+        turn = np.arctan2(way[0] * moved[1] - way[1] * moved[0], way @ moved)
+        faster = (far / max(float(np.linalg.norm(moved)), 0.05)) ** (0.6 * share)
+        offset = np.clip(strike[1] + share * turn / self.SIDEWAYS, -0.04, 0.04)
+        return float(np.clip(strike[0] * faster, 0.15, 1.3)), float(offset)
 
     def _strike(self, way: np.ndarray, speed: float, offset: float) -> list[np.ndarray]:
         """Return the actions that move the hand aside by ``offset`` (m), and then along ``way`` with ``speed``."""
