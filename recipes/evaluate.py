@@ -32,8 +32,7 @@ class Config:
     trust_remote_code: bool = False
     # Seed of the run's policy.
     seed: int = 0
-    # Task: balance_reaching, ..., mujoco:FetchPush, ..., or module:Class of your own; by default that of the run, else
-    # balance_reaching.
+    # Task, such as mujoco:FetchPush, or module:Class of your own; by default that of the run, else balance_reaching.
     task: str | None = None
     # Delay of the frames in control steps of 50 ms. The world model imagines the steps up to the present.
     delay: int = 0
@@ -95,6 +94,8 @@ def judge_policy(config: Config) -> tuple[Path, str, dict]:
     """Return the folder with an animation, the numbers as text, and the result with the outcome of every episode."""
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.evaluation.protocol import evaluate
+    from dynmap_rl.modules.actor import Actor
+    from dynmap_rl.modules.delayed_actor import DelayedActor
     from dynmap_rl.reporting.media import film_policy
     from dynmap_rl.runs.lookup import find_run, task_of_run
 
@@ -104,7 +105,9 @@ def judge_policy(config: Config) -> tuple[Path, str, dict]:
     description = get_task(task, from_file=not config.task).description
     actor = load_policy(config, folder, description)
     if delay and not config.stale:
-        actor = imagine_present(actor, delay)
+        if not isinstance(actor, Actor):
+            raise ValueError("--policy must be a run for --delay; add --stale for a LeRobot policy")
+        actor = DelayedActor(actor, max_delay=delay.longest)
     result = evaluate(actor, task, config.eval, delay)["test"]
     summary = result["summary"]
     low, high = summary["SR_interval"]
@@ -127,16 +130,6 @@ def read_delay(config: Config):
         refuse(config, Config(), ["stale"], "frames in time")
         return None
     return delay
-
-
-def imagine_present(actor, delay):
-    """Return the actor whose world model imagines the steps up to the present."""
-    from dynmap_rl.modules.actor import Actor
-    from dynmap_rl.modules.delayed_actor import DelayedActor
-
-    if not isinstance(actor, Actor):
-        raise ValueError("--policy must be a run for --delay; add --stale for a LeRobot policy")
-    return DelayedActor(actor, max_delay=delay.longest)
 
 
 def load_policy(config: Config, folder: Path, instruction: str):
