@@ -88,7 +88,7 @@ def _roll_out(
         env = TransformedEnv(env, Compose(RenameTransform(["pixels"], ["present"], create_copy=True), late))
     pixels = "present" if delay else "pixels"
     keys = ["action", "goal", *EVENTS, *([pixels] if keep_pixels else [])]
-    td = env.reset(TensorDict({"scene_seed": torch.tensor(seeds)}, [count]))
+    td = env.reset(scene_seed=torch.tensor(seeds))
     world_model = getattr(actor, "world_model", None)
     sizes = {q: len(env.layout.dynamics[q]) for q in (world_model.supervision if world_model else ())}
     predicted = {quantity: torch.zeros(count, size, device=device) for quantity, size in sizes.items()}

@@ -10,9 +10,9 @@ from torchrl.envs import ParallelEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 import dynmap_rl  # noqa: F401 (registers the tasks)
-from dynmap_rl.envs import torchrl_env
 from dynmap_rl.envs.delay import DelayFrames, FrameDelay
 from dynmap_rl.envs.delay_transform import DelayTransform
+from dynmap_rl.envs.task import LAYOUT, Task
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 
 DELAY = FrameDelay(3, 2, 0.2)
@@ -112,7 +112,7 @@ def test_a_partial_reset_leaves_the_other_worlds_as_they_are(bursts):
 
 
 def test_each_episode_of_a_long_rollout_begins_with_its_own_first_frame(monkeypatch):
-    monkeypatch.setattr(torchrl_env, "EPISODE_STEPS", 7)
+    monkeypatch.setattr(Task, "layout", replace(LAYOUT, steps=7))
     env = make_env(FrameDelay(4))
     out = env.rollout(14, break_when_any_done=False)
     assert out["delay"][0].flatten().tolist() == [0, 1, 2, 3, 4, 4, 4] * 2

@@ -1,5 +1,7 @@
 """Delayed actor: late, lost and disordered frames against frames in time."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from small import CONSTANTS, make_model
@@ -8,9 +10,9 @@ from torchrl.collectors import Collector
 from torchrl.envs import Compose, InitTracker, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from dynmap_rl.envs import torchrl_env
 from dynmap_rl.envs.delay import FrameDelay
 from dynmap_rl.envs.delay_transform import DelayTransform
+from dynmap_rl.envs.task import LAYOUT, Task
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.modules.actor import MEMORY, Actor
 from dynmap_rl.modules.checkpoints import make_policy
@@ -185,7 +187,7 @@ def make_env(actor, delay=DELAY, bursts=True):
 @pytest.mark.parametrize("bursts", [True, False])
 @torch.no_grad()
 def test_rollouts_and_collectors(kind, bursts, monkeypatch):
-    monkeypatch.setattr(torchrl_env, "EPISODE_STEPS", 8)
+    monkeypatch.setattr(Task, "layout", replace(LAYOUT, steps=8))
     actor = DelayedActor(make_actor(kind), max_delay=5)
     env = make_env(actor, bursts=bursts)
     check_env_specs(env)

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from lerobot.robots import Robot, RobotConfig
 
-from dynmap_rl.data.format.writing import FEATURES
+from dynmap_rl.envs.task import LAYOUT
 from dynmap_rl.envs.world import CONTROL_DT
 from dynmap_rl.keys import CAMERA, FRAME_SHAPE
 
 from .environment import DynmapEnvConfig, make_env
 
-STATE = "step", *FEATURES["observation.state"]["names"]
-ACTION = tuple(FEATURES["action"]["names"])
+STATE = "step", *LAYOUT.state
+ACTION = LAYOUT.action
 FRONT = CAMERA.rpartition(".")[2]
 HOLD = np.zeros(len(ACTION), np.float32)
 
