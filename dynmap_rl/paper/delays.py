@@ -130,7 +130,7 @@ def _draw_line(axis, result: dict, color) -> None:
     time = [1000 * CONTROL_DT * step for step in steps]
     low, high = zip(*(cell["SR_interval"] for cell in cells), strict=True)
     text, _, _, stale = CONDITIONS[result["condition"]]
-    axis.plot(
-        time, [c["SR"] for c in cells], "--" if stale else "-", color=color, lw=1.4, marker=".", label=text
-    )
+    width = 3 if result["condition"] == "imagined" else 1.4  # others may lie on it
+    style, rates = "--" if stale else "-", [cell["SR"] for cell in cells]
+    axis.plot(time, rates, style, color=color, lw=width, marker=".", label=text)
     axis.fill_between(time, low, high, color=color, alpha=0.12, lw=0)
