@@ -15,6 +15,7 @@ runs/evaluate gets the numbers and a page with some of the episodes, failures fi
 
 import sys
 from dataclasses import asdict, astuple, dataclass
+from functools import partial
 from pathlib import Path
 
 from dynmap_rl.evaluation.settings import Evaluation
@@ -168,18 +169,19 @@ def judge_expert(config: Config) -> tuple[Path, str, dict]:
     from dynmap_rl.reporting.media import film, film_demonstrator
 
     task = get_task(config.task or "balance_reaching")
-    expert = config.expert or ("scripted" if task.is_scripted else task.name)
-    seeds = scene_seeds(config.eval.split, config.eval.episodes)
+    expert, seeds = config.expert or task.name, scene_seeds(config.eval.split, config.eval.episodes)
     if task.is_scripted:
         refuse(config, Config(), ["expert", "checkpoint"], f"{config.task}, which has an expert of its own")
-        checkpoint, outcomes = "demonstrator", judge_demonstrator(task, seeds)
-    elif expert == "careless":
-        checkpoint, network, trained_on = "baseline", CarelessController(task), task
+        expert, checkpoint = "scripted", "demonstrator"
+        outcomes, draw = judge_demonstrator(task, seeds), partial(film_demonstrator, config.task)
     else:
-        checkpoint = config.checkpoint or list_checkpoints(expert)[-1]
-        network, trained_on = load_expert(expert, checkpoint), task_of_expert(expert, task)
-    if not task.is_scripted:
+        if expert == "careless":
+            checkpoint, network, trained_on = "baseline", CarelessController(task), task
+        else:
+            checkpoint = config.checkpoint or list_checkpoints(expert)[-1]
+            network, trained_on = load_expert(expert, checkpoint), task_of_expert(expert, task)
         outcomes = list_outcomes(task, roll_out(network, task, seeds, states=trained_on))
+        draw = partial(film, network, task, states=trained_on)
     rates = {name: 100 * sum(values) / len(seeds) for name, values in outcomes.items()}
     intervals = {name: wilson(sum(values), len(seeds)) for name, values in outcomes.items()}
     lines = [
@@ -187,11 +189,7 @@ def judge_expert(config: Config) -> tuple[Path, str, dict]:
         for name, rate in rates.items()
     ]
     folder = name_folder(config, task.name, *Path(expert).parts[-4:], checkpoint)
-    some = failures_first(seeds, outcomes["success"])
-    if task.is_scripted:
-        film_demonstrator(config.task, some, folder / "rollouts.gif")
-    else:
-        film(network, task, some, folder / "rollouts.gif", states=trained_on)
+    draw(failures_first(seeds, outcomes["success"]), folder / "rollouts.gif")
     result = {"task": config.task or task.name, "expert": expert, "checkpoint": checkpoint}
     return folder, "\n".join(lines), result | {"rates": rates, "intervals": intervals}
 

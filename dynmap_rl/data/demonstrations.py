@@ -137,8 +137,8 @@ def load_meta(dataset: str | Path) -> dict:
 
     Returns:
         ``format``, ``task``, ``layout`` (except of cart and block), ``expert``, ``kind``, ``splits`` (name to first
-        episode and the one after the last),
-        ``normalization`` (see :func:`dynmap_rl.data.normalization_constants`), and ``episodes``, a dict for each:
+        episode and the one after the last), ``normalization`` (see :func:`dynmap_rl.data.normalization_constants`), and
+        ``episodes``, a dict for each:
         ``episode_index``, ``split``, ``scene_seed``, ``checkpoint``, ``noise``, ``detours``, ``pushes``, ``scene``,
         ``success``, ``dropped``, ``position_error`` (m).
 
@@ -264,9 +264,8 @@ def _decode_frames(root: Path, table: pa.Table, layout: Layout) -> torch.Tensor:
                     f"{root}: frame {row} {error}; restore the dataset or record it again"
                 ) from error
             frames[i] = frame
-        pixels[rows.start : rows.stop, ..., place] = frames.transpose(
-            0, 3, 1, 2
-        )  # all at once: a sixth less time
+        # All at once: a sixth less time.
+        pixels[rows.start : rows.stop, ..., place] = frames.transpose(0, 3, 1, 2)
 
     blocks = [range(i, min(i + 500, len(table))) for i in range(0, len(table), 500)]
     with ThreadPoolExecutor() as pool:

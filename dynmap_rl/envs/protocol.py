@@ -114,6 +114,7 @@ class BaseTask(ABC):
         symmetric: whether a demonstration that is mirrored left to right, or shifted, is a demonstration of the task.
         planar: whether frames are flat pictures of the plane that recolouring, mirroring and shifting keep in agreement
             with the dynamics. World models of other tasks are trained without augmentation.
+        pushes: number of pushes in a disturbed demonstration.
         max_worlds: number of worlds that fit into memory at a time; None for any number.
         state_size: number of entries S of ``state``.
     """
@@ -121,6 +122,7 @@ class BaseTask(ABC):
     ranges: Any = None
     symmetric: bool = False
     planar: bool = False
+    pushes: int = 0
     max_worlds: int | None = None
 
     @property

@@ -11,7 +11,6 @@ import numpy as np
 
 from .geometry import Polygon, square
 from .protocol import BaseTask, Layout
-from .renderer import Renderer
 from .scene import GOAL_COLOR, Color, Scene, SceneRanges, sample_scene
 from .world import (
     ACCELERATION_LIMIT,
@@ -94,6 +93,8 @@ class Task(BaseTask):
 
     def make_renderer(self) -> Callable[[World], np.ndarray]:
         """Return the function that draws a world, uint8 ``[64, 64, 3]``."""
+        from .renderer import Renderer  # loads pygame, which reading a dataset does not need
+
         return partial(Renderer(self.layout.image_size).draw, task=self)
 
     def describe(self, seed: int) -> dict:

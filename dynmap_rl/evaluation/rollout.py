@@ -64,8 +64,8 @@ def roll_out(
     for start in range(0, len(seeds), size):
         some = seeds[start : start + size]
         full = some + seeds[: size - len(some)]  # a batch always has the same size
-        pushes = [draw_pushes(seed, getattr(rules, "pushes", 0) if pushed else 0) for seed in full]
-        episodes = _roll_out(actor, env, full, keep_pixels, delay, pushes, f"{len(seeds)} episodes")
+        plans = [Plan(seed, "", pushes=draw_pushes(seed, rules.pushes * pushed)) for seed in full]
+        episodes = _roll_out(actor, env, plans, keep_pixels, delay, f"{len(seeds)} episodes")
         parts.append(episodes[: len(some)])
     return torch.cat(parts)
 
@@ -73,16 +73,15 @@ def roll_out(
 def _roll_out(
     actor: TensorDictModuleBase,
     env: DynmapBatchedEnv,
-    seeds: list[int],
+    plans: list[Plan],
     keep_pixels: bool,
     delay: FrameDelay | None,
-    pushes: list,
     title: str,
 ) -> TensorDict:
-    """Run one episode in every world of an environment, ``[E, T]``."""
+    """Run one episode in every world of an environment by scene and pushes of its plan, ``[E, T]``."""
     if hasattr(actor, "reset"):  # a LeRobot policy keeps its memory itself
         actor.reset()
-    count, device = len(seeds), env.device
+    count, device, seeds = len(plans), env.device, [plan.scene_seed for plan in plans]
     if delay:
         late = DelayTransform(delay, seeds, bursts=isinstance(actor, DelayedActor))
         env = TransformedEnv(env, Compose(RenameTransform(["pixels"], ["present"], create_copy=True), late))
@@ -92,12 +91,11 @@ def _roll_out(
     world_model = getattr(actor, "world_model", None)
     sizes = {q: len(env.layout.dynamics[q]) for q in (world_model.supervision if world_model else ())}
     predicted = {quantity: torch.zeros(count, size, device=device) for quantity, size in sizes.items()}
-    plans = [Plan(seed, "", pushes=spans) for seed, spans in zip(seeds, pushes, strict=True)]
-    steps = []
+    pushed, steps = any(plan.pushes for plan in plans), []
     for t in tqdm(range(env.layout.steps), title, unit="step", leave=False):
         dynamics = env.read_dynamics()
         td = actor(td)
-        if any(pushes):
+        if pushed:
             action = td["action"].double().cpu().numpy()
             push(t, action, plans, env.worlds)
             td["action"] = torch.as_tensor(action, dtype=torch.float32, device=device)
@@ -121,7 +119,8 @@ def episode_rows(episodes: TensorDict, seeds: list[int]) -> list[dict]:
     Returns:
         Rows with ``scene_seed``, ``dropped``, ``touched`` (the cart touched a wall), ``position_error`` (m) and
         ``success``. If the world model decodes positions, ``localization_error`` is the mean distance between predicted
-        and true position of the first body, the cart or the object of a MuJoCo task (m), and ``localization_error_away`` its mean over the steps more than 0.1 m from the goal.
+        and true position of the first body, the cart or the object of a MuJoCo task (m), and
+        ``localization_error_away`` its mean over the steps more than 0.1 m from the goal.
     """
     last = episodes["next"][:, -1]
     rows = [

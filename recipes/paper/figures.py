@@ -55,15 +55,14 @@ def main(config: Config) -> None:
     for name in names:
         try:
             FIGURES[name][0](config, datasets)
-            print(f"written: {config.output / name}.png", flush=True)
             drawn.append(name)
         except ValueError as error:
             missing.append(f"{name}: {error}")
     if drawn:
         captions = {f"{name}.png": caption for name, (_, caption) in FIGURES.items()}
         text = "\n".join([f"drawn: {', '.join(drawn)}", *missing])
-        command = command_line(sys.argv)
-        write_html(config.output, "The paper's figures", text, command, plain_settings(config), captions)
+        settings = plain_settings(config)
+        write_html(config.output, "The paper's figures", text, command_line(sys.argv), settings, captions)
     if missing:
         raise ValueError("; ".join(missing))
 
@@ -94,14 +93,14 @@ def load_episodes(config: Config, datasets: dict, task: str, split: str = "eval"
 def how_to_run(config: Config, cells: list[str]) -> str:
     """Return the command for the first of the cells."""
     command = f"python recipes/paper/tables.py --results runs/results --only {cells[0]}"
-    others = f" ({len(cells) - 1} more: without --only)" if len(cells) > 1 else ""
-    return f"{config.runs / cells[0]} must be a finished run; run {command}{others}"
+    command += f" ({len(cells) - 1} more: without --only)" if len(cells) > 1 else ""
+    return f"{config.runs / cells[0]} must be a finished run; run {command}"
 
 
 def find_missing(config: Config, cells: list[str]) -> list[str]:
     """Return and print the cells without a finished run; ``ValueError`` if none of the cells has one."""
     missing = [cell for cell in cells if not (config.runs / cell / "eval.json").exists()]
-    if len(missing) == len(cells):
+    if missing == cells:
         raise ValueError(how_to_run(config, missing))
     if missing:
         print(f"{len(cells) - len(missing)} of {len(cells)} runs are there: {how_to_run(config, missing)}")
@@ -116,9 +115,9 @@ def draw_distributions(config: Config, datasets: dict) -> None:
 
     dynamics = {task: load_episodes(config, datasets, task, "train")["dynamics"] for task in datasets}
     ranges = plot_distributions(dynamics, config.output / "distributions.png")
-    names = [str(folder) for folder in datasets.values()]
-    facts = {"command": command_line(sys.argv), "commit": find_commit(), "datasets": names, "ranges": ranges}
-    write_json(config.output / "distributions.json", facts)
+    made = {"command": command_line(sys.argv), "commit": find_commit()}
+    names = list(map(str, datasets.values()))
+    write_json(config.output / "distributions.json", made | {"datasets": names, "ranges": ranges})
 
 
 def draw_fig2(config: Config, datasets: dict) -> None:
@@ -153,8 +152,8 @@ def draw_prediction(config: Config, datasets: dict, task: str, name: str) -> Non
 
     find_missing(config, [WORLD_MODEL])
     world_model = load_world_model(config.runs / WORLD_MODEL / "world_model")
-    title = f"World model of task 1 (RGB+[P+V+A]) on held-out episodes of {TASKS[task]}"
     episodes = widest_ways(load_episodes(config, datasets, task), 2)
+    title = f"World model of task 1 (RGB+[P+V+A]) on held-out episodes of {TASKS[task]}"
     plot_prediction(world_model, episodes, config.output / f"{name}.png", title)
 
 
@@ -178,10 +177,10 @@ def draw_fig8(config: Config, datasets: dict) -> None:
     from dynmap_rl.runs.lookup import load_actor
 
     missing, panels = find_missing(config, list(POLICIES.values())), dict.fromkeys(POLICIES)
+    seeds = scene_seeds("test", 50, start=SHARED_STARTS)
     for title, cell in POLICIES.items():
         if cell not in missing:
-            actor = load_actor(config.runs / cell)
-            panels[title] = roll_out(actor, ONE, scene_seeds("test", 50, start=SHARED_STARTS))
+            panels[title] = roll_out(load_actor(config.runs / cell), ONE, seeds)
     plot_position_errors(panels, config.output / "fig8.png")
 
 

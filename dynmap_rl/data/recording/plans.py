@@ -64,7 +64,7 @@ def plan_demonstrations(
         count: number of episodes.
         expert: folder or task of the expert's checkpoints; by default the expert that ships for the task.
     """
-    checkpoints, pushed = find_checkpoints(task, expert), getattr(get_task(task), "pushes", 0)
+    checkpoints, pushed = find_checkpoints(task, expert), get_task(task).pushes
     plans = []
     for i in range(start, start + count):
         seed = scene_seed(split, i)
