@@ -68,7 +68,7 @@ def write_episodes(folder: Path, episodes: TensorDict, instruction: str, layout:
             for name in columns:
                 if features[name]["dtype"] == "float32":
                     buffer[name] = [value.astype(np.float64) for value in buffer[name]]
-            with _embedding_in_batches():
+            with _without_cache():
                 dataset.save_episode()
         dataset.finalize()
     written = load_dataset(folder, layout=layout)
@@ -92,7 +92,7 @@ def merge_datasets(
     Returns:
         All episodes, as :func:`dynmap_rl.data.load_dataset` returns them.
     """
-    with quiet(), _embedding_in_batches():
+    with quiet(), _without_cache():
         import datasets
         from lerobot.datasets.aggregate import aggregate_datasets
         from lerobot.datasets.io_utils import load_info, load_stats, write_info, write_stats
@@ -142,16 +142,22 @@ def _compute_stats(root: Path, layout: Layout) -> dict[str, dict[str, np.ndarray
 
 
 @contextlib.contextmanager
-def _embedding_in_batches():
-    """Embed the images of an episode in one batch, in half the time that LeRobot takes row by row."""
+def _without_cache():
+    """Embed the images of an episode at once, and without the hashes that ``datasets`` takes of it for its cache.
+
+    LeRobot embeds row by row.
+    """
+    from datasets import Dataset, arrow_dataset
+    from datasets.fingerprint import generate_random_fingerprint
     from datasets.table import embed_table_storage
     from lerobot.datasets import dataset_writer, io_utils
 
     def embed_images(dataset):
-        embedded = dataset.with_format("arrow").map(embed_table_storage, batched=True)
-        return embedded.with_format(**dataset.format)
+        table = embed_table_storage(dataset.data.table)
+        return Dataset(table, info=dataset.info, split=dataset.split)
 
     with (
+        _replaced(arrow_dataset, "generate_fingerprint", lambda dataset: generate_random_fingerprint()),
         _replaced(io_utils, "embed_images", embed_images),
         _replaced(dataset_writer, "embed_images", embed_images),
     ):
