@@ -11,6 +11,9 @@ from torch import nn
 class CameraEncoders(nn.Module):
     """Sum of the latents of one encoder for each camera, which is one linear map of the features of all.
 
+    The latents are rolled by Z / C entries from camera to camera, so that the first entries of each, which begin as
+    positions (:class:`GlimpseEncoder`), are apart.
+
     Args:
         encoders: encoders of frames ``[..., 3, S, S]``, one for each camera.
         image_size: S.
@@ -30,11 +33,13 @@ class CameraEncoders(nn.Module):
         if pixels.shape[-3:] != shape:
             raise ValueError(f"pixels must be [..., {', '.join(map(str, shape))}], got {list(pixels.shape)}")
         frames = pixels.split(self.image_size, -1)
-        return sum(encode(frame) for encode, frame in zip(self.encoders, frames, strict=True))
+        latents = [encode(frame) for encode, frame in zip(self.encoders, frames, strict=True)]
+        step = latents[0].shape[-1] // len(latents)
+        return sum(latent.roll(i * step, -1) for i, latent in enumerate(latents))
 
 
 class CameraDecoders(nn.Module):
-    """One decoder for each camera.
+    """One decoder for each camera, with the latent rolled back by as much as :class:`CameraEncoders` rolls it.
 
     Args:
         decoders: decoders of frames ``[..., 3, S, S]``, one for each camera.
@@ -48,4 +53,7 @@ class CameraDecoders(nn.Module):
         self, predicted_latent: torch.Tensor, hidden1: torch.Tensor, hidden2: torch.Tensor
     ) -> torch.Tensor:
         """Decode ``[..., Z]`` and ``[..., H]`` twice to frames ``[..., 3, S, cameras * S]``, about 0..1."""
-        return torch.cat([decode(predicted_latent, hidden1, hidden2) for decode in self.decoders], -1)
+        step = predicted_latent.shape[-1] // len(self.decoders)
+        latents = [predicted_latent.roll(-i * step, -1) for i in range(len(self.decoders))]
+        frames = [d(z, hidden1, hidden2) for d, z in zip(self.decoders, latents, strict=True)]
+        return torch.cat(frames, -1)

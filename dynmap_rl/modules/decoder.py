@@ -55,7 +55,8 @@ class SpriteDecoder(nn.Module):
     On the canvas, a CNN mixes M predicted colours at every pixel, so that a marker or a background changes its colour by
     three numbers. The sprites are the counterpart of :class:`~dynmap_rl.modules.GlimpseEncoder`, as the writing half of
     DRAW (Gregor et al. 2015): moving an object changes two numbers and not a filter for every place, and each pixel of
-    a sprite has a colour of its own from the start.
+    a sprite has a colour of its own from the start. Before training, sprite i is where the i-th attention map of the
+    encoder looks, so that small things such as a marker get a sprite too.
 
     Args:
         input_size: Z + 2 H.
@@ -71,10 +72,10 @@ class SpriteDecoder(nn.Module):
     def __init__(
         self,
         input_size: int,
-        sprites: int = 3,
+        sprites: int = 6,
         side: int = 16,
         spacing: float = 1.5,
-        colors: int = 6,
+        colors: int = 4,
         width: int = 256,
         channels: tuple[int, int] = (64, 32),
         image_size: int = 64,
@@ -85,8 +86,8 @@ class SpriteDecoder(nn.Module):
         self.masks = PlainDecoder(input_size, channels, colors, image_size)
         self.colors = nn.Sequential(nn.Linear(input_size, width), nn.SiLU(), nn.Linear(width, 3 * colors))
         self.place = nn.Linear(input_size, sprites * 2)
-        nn.init.normal_(self.place.weight, std=0.05)
-        nn.init.uniform_(self.place.bias, -0.3, 0.3)
+        nn.init.eye_(self.place.weight)
+        nn.init.zeros_(self.place.bias)
         self.paint = nn.Sequential(
             nn.Linear(input_size, width), nn.SiLU(), nn.Linear(width, sprites * 4 * side**2)
         )
@@ -97,10 +98,11 @@ class SpriteDecoder(nn.Module):
     ) -> torch.Tensor:
         """Decode ``[..., Z]`` and ``[..., H]`` twice to frames ``[..., 3, S, S]``, about 0..1."""
         x = torch.cat([predicted_latent, hidden1, hidden2], -1)
-        frames = self.draw_canvas(x.flatten(0, -2))
-        for sprite in self.draw_sprites(x.flatten(0, -2)).unbind(1):
-            frames = frames * (1 - sprite[:, 3:]) + sprite[:, :3]
-        return frames.unflatten(0, x.shape[:-1])
+        frames = self.draw_canvas(x.flatten(0, -2)).transpose(1, 2)  # rows first, as the sprites are
+        color, opacity = self.draw_sprites(x.flatten(0, -2)).split((3, 1), 3)
+        for sprite, clear in zip(color.unbind(1), (1 - opacity).unbind(1), strict=True):
+            frames = torch.addcmul(sprite, frames, clear)
+        return frames.transpose(1, 2).unflatten(0, x.shape[:-1])
 
     def draw_canvas(self, x: torch.Tensor) -> torch.Tensor:
         """Draw what is behind the sprites, ``[N, 3, S, S]``, from states ``[N, Z + 2 H]``."""
@@ -109,7 +111,7 @@ class SpriteDecoder(nn.Module):
         return (colors.mT @ masks).unflatten(2, (self.image_size, self.image_size))
 
     def draw_sprites(self, x: torch.Tensor) -> torch.Tensor:
-        """Draw each sprite, ``[N, sprites, 4, S, S]``: colours times opacity, and opacity."""
+        """Draw each sprite, ``[N, sprites, S, 4, S]``, rows first: colours times opacity, and opacity."""
         count, side = len(x), self.side
         sprites = self.paint(x).float().view(count, self.sprites, side, 4, side)  # rows first
         opacity = (4 * sprites[..., 3:, :] - 2).sigmoid()
@@ -119,7 +121,7 @@ class SpriteDecoder(nn.Module):
         size, spacing = self.image_size, self.spacing
         across, down = (spacing * hat_kernels(place, side, spacing, size)).unbind(2)  # (N, sprites, side, S)
         rows = (down.mT @ sprites.flatten(3)).unflatten(3, (4, side))  # (N, sprites, S, 4, side)
-        return (rows.flatten(2, 3) @ across).unflatten(2, (size, 4)).transpose(2, 3)
+        return (rows.flatten(2, 3) @ across).unflatten(2, (size, 4))
 
 
 class DynamicsDecoder(nn.Module):

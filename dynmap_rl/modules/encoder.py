@@ -66,14 +66,13 @@ class PlainEncoder(Encoder):
         x = to_blocks(x).to(dtype)  # (N, 48, S / 4, S / 4)
         pixels = x.permute(0, 2, 3, 1).flatten(1, 2)  # (N, S^2 / 16, 48); a product is the fastest mean
         count = pixels.shape[1]
-        color = (x.new_full((1, count), 1 / count) @ pixels).float().view(-1, 3, BLOCK**2).mean(
-            -1
-        ) / 255 - 0.5
+        color = (x.new_full((1, count), 1 / count) @ pixels).float().view(-1, 3, BLOCK**2).mean(-1)
         # Scaling the weights replaces x / 255 - 0.5.
         weight, bias = self.stem.weight / 255, self.stem.bias - 0.5 * self.stem.weight.sum((1, 2, 3))
         x = F.conv2d(x, weight, bias, padding=1).relu()  # (N, C, S / 4, S / 4)
         y = self.top(x)  # (N, C, S / 8, S / 8)
-        return self.project(y.flatten(1)) + 5 * self.color(color)  # (N, Z); mean colours differ little
+        # Mean colours differ little.
+        return self.project(y.flatten(1)) + 5 * self.color(color / 255 - 0.5)  # (N, Z)
 
 
 class GlimpseEncoder(Encoder):
@@ -84,7 +83,7 @@ class GlimpseEncoder(Encoder):
     softmax, Levine et al. 2016), the frame's mean colour there, and learned features. Around the positions of the first
     G maps, the encoder reads glimpses: small images that move with the map, as in DRAW (Gregor et al. 2015). In a
     glimpse an object stands at the same place wherever it is in the frame, so that a linear map finds its parts, their
-    colours and its tilt.
+    colours and its tilt. Before training, the first 2 K entries of the latent are the positions of the maps in -1..1.
 
     Args:
         latent_size: Z.
@@ -102,7 +101,7 @@ class GlimpseEncoder(Encoder):
         self,
         latent_size: int = 64,
         channels: tuple[int, int] = (32, 48),
-        maps: int = 8,
+        maps: int = 6,
         features: int = 8,
         glimpses: int = 2,
         samples: int = 16,
@@ -123,6 +122,7 @@ class GlimpseEncoder(Encoder):
         self.read = nn.Sequential(nn.Linear(glimpses * 3 * samples**2, width), nn.SiLU())
         self.mlp = nn.Sequential(nn.Linear(pooled + width, width), nn.SiLU(), nn.Linear(width, latent_size))
         self.linear = nn.Linear(pooled + width, latent_size)
+        self._start_with_positions()
         # A constant product in the place of sums over strided memory, which are several times as slow.
         self.register_buffer("places", _split_blocks(make_grid(image_size // 2).permute(2, 0, 1)[None]).mT)
         self.register_buffer("average", _averages())  # (48, 4 * 3)
@@ -151,6 +151,16 @@ class GlimpseEncoder(Encoder):
         pooled = torch.cat(values, -1)
         return self.mlp(pooled) + self.linear(pooled)
 
+    @torch.no_grad()
+    def _start_with_positions(self) -> None:
+        """Let the first 2 K entries of the latent start as the positions, where the decoder's sprites start."""
+        count = min(2 * self.maps, self.linear.out_features)
+        for layer in (self.mlp[-1], self.linear):
+            layer.weight[:count] = 0
+            layer.bias[:count] = 0
+        entry = torch.arange(count)
+        self.linear.weight[entry, 5 * (entry // 2) + entry % 2] = 0.5  # of twice (x, y, red, green, blue)
+
     def look(self, x: torch.Tensor, centers: torch.Tensor, background: torch.Tensor) -> torch.Tensor:
         """Read glimpses of frames ``[N, 3, S, S]``.
 
@@ -167,9 +177,8 @@ class GlimpseEncoder(Encoder):
         rows = down.flatten(1, 2) @ x.transpose(1, 2).flatten(2)  # (N, G samples, 3 S)
         rows = rows.view(*centers.shape[:2], -1, size)  # (N, G, samples * 3, S)
         seen = (rows @ across.mT).unflatten(2, (-1, 3))
-        inside = (
-            down.sum(-1)[..., None, None] * across.sum(-1)[:, :, None, None]
-        )  # (N, G, samples, 1, samples)
+        # (N, G, samples, 1, samples)
+        inside = down.sum(-1)[..., None, None] * across.sum(-1)[:, :, None, None]
         return seen - inside * background[:, None, None, :, None]
 
 
@@ -191,5 +200,8 @@ def _averages() -> torch.Tensor:
 
 @torch.no_grad()
 def _rarity(x: torch.Tensor) -> torch.Tensor:
-    """Return the logarithm of the mean rarity of the colours at the places of a map, ``[N, 1, S^2 / 4]``."""
-    return _split_blocks(F.avg_pool2d(color_weights(x, 0.75)[:, None], BLOCK // SUB)).log()
+    """Return the logarithm of the rarity of the colours at the places of a map, ``[N, 1, S^2 / 4]``, up to a constant."""
+    weight = color_weights(x, 0.75)[:, None]
+    for axis in (-2, -1):  # several times as fast as pooling
+        weight = sum(weight.unfold(axis, 2, 2).unbind(-1))
+    return _split_blocks(weight).log()

