@@ -22,6 +22,7 @@ CONDITIONS = {  # name: text, settings of the frames besides the delay, whether 
     "jitter": ("jitter of 2 steps", {"jitter": 2}, False, False),
     "lost_10": ("10 % of the frames lost", {"lost": 0.1}, False, False),
     "lost_30": ("30 % of the frames lost", {"lost": 0.3}, False, False),
+    "past_actions": ("feed-forward with past actions", {}, False, True),
     "pushed": ("unannounced pushes", {}, True, False),
     "pushed_stale": ("unannounced pushes, stale frames", {}, True, True),
 }
@@ -100,7 +101,8 @@ def plot_delays(results: list[dict], path: Path) -> None:
         sharey=True,
         layout="constrained",
     )
-    colors = dict(zip(CONDITIONS, (*plt.get_cmap("tab20").colors[::2], (0, 0, 0)), strict=True))
+    shades = plt.get_cmap("tab20").colors
+    colors = dict(zip(CONDITIONS, (*shades[::2], shades[1], (0, 0, 0)), strict=True))
     for axis in axes.flat[len(panels) :]:
         axis.remove()
     for axis, (name, lines) in zip(axes.flat, panels.items(), strict=False):

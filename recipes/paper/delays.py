@@ -6,17 +6,20 @@
     python recipes/paper/delays.py --write        # figure and table from the results alone
 
 Each run is evaluated under each condition: on stale frames; with the world model rolled forward; with a delay that is
-reported wrongly; with jitter, lost frames, and pushes that the policy is not told. A run and a condition have one JSON
-file, with a cell for each delay, written after every cell; cells that are there are skipped, so that the same command
-resumes a stopped grid. A LeRobot policy, such as ACT, is evaluated with chunks from which the actions of the delay are
-cut; train one with the command in dynmap_rl/integrations/lerobot/README.md.
+reported wrongly; with jitter, lost frames, and pushes that the policy is not told; and, in the place of its policy, with
+a feed-forward policy that is trained to act on an old state of the run's world model and the actions since. A run and a
+condition have one JSON file, with a cell for each delay, written after every cell; cells that are there are skipped, so
+that the same command resumes a stopped grid. A LeRobot policy, such as ACT, is evaluated with chunks from which the
+actions of the delay are cut; train one with the command in dynmap_rl/integrations/lerobot/README.md.
 """
 
 import sys
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 from dynmap_rl.evaluation.settings import Evaluation
+from dynmap_rl.training.settings import PolicyTraining
 from dynmap_rl.utils.cli import command_line, refuse, run_recipe
 from dynmap_rl.utils.devices import Compute
 
@@ -33,6 +36,8 @@ class Config:
     seed: int = 0
     # Task; by default that of each run.
     task: str | None = None
+    # Dataset of the policy with past actions: a folder or a hub id; by default datasets/TASK, recorded where missing.
+    dataset: str | None = None
     # Conditions with commas between; by default all.
     conditions: str = ""
     # Delays in control steps of 50 ms, with commas between; by default 0 to 30.
@@ -45,6 +50,8 @@ class Config:
     dry_run: bool = False
     # Draw the figure and write the table, README.md in the folder of the results, from the results alone.
     write: bool = False
+    # Training of the policy with past actions.
+    policy: PolicyTraining = PolicyTraining(kind="feedforward")
     # Evaluation in closed loop, here without the paper's protocol.
     eval: Evaluation = Evaluation(paper_episodes=0)
     # Device and cores.
@@ -56,8 +63,11 @@ def main(config: Config) -> None:
     import torch
 
     from dynmap_rl.paper.delays import CONDITIONS, DELAYS, frame_delay
+    from dynmap_rl.runs.lookup import find_run
 
-    refuse(config.eval, Evaluation(paper_episodes=0), ["paper_episodes"], "recipes/paper/delays.py", "eval.")
+    recipe, baseline = "recipes/paper/delays.py", PolicyTraining(kind="feedforward")
+    refuse(config.eval, Evaluation(paper_episodes=0), ["paper_episodes"], recipe, "eval.")
+    refuse(config.policy, baseline, ["kind", "corrections"], recipe, "policy.")
     if config.write:
         return write(config)
     conditions = config.conditions.split(",") if config.conditions else list(CONDITIONS)
@@ -72,6 +82,8 @@ def main(config: Config) -> None:
     for run in config.runs.split(","):
         for condition in conditions:
             path, result = open_result(config, run, condition)
+            if condition == "past_actions" and not has_world_model(find_run(run)):
+                continue
             for steps in delays:
                 delay = frame_delay(condition, steps)
                 if delay is None or str(steps) in result["cells"]:
@@ -105,6 +117,11 @@ def open_result(config: Config, run: str, condition: str) -> tuple[Path, dict]:
     return path, result
 
 
+def has_world_model(folder: Path) -> bool:
+    """Return whether a folder is a run of ours, and not a LeRobot policy."""
+    return (folder / "world_model").exists() or any(folder.glob("seed_*"))
+
+
 def evaluate_cell(config: Config, path: Path, result: dict, steps: int) -> None:
     """Evaluate a run under a condition with one delay, and add the cell to the file."""
     from dynmap_rl.evaluation.protocol import evaluate
@@ -114,10 +131,9 @@ def evaluate_cell(config: Config, path: Path, result: dict, steps: int) -> None:
 
     _, _, pushed, stale = CONDITIONS[result["condition"]]
     delay = frame_delay(result["condition"], steps)
-    actor, names = load_actor(config, result["run"], None if stale else delay)
+    actor, names = load_actor(config, result, None if stale else delay)
     found = evaluate(actor, result["task"], config.eval, delay, pushed)["test"]
-    names_of_cell = "SR", "SR_interval", "DR", "DR_interval", "PE"
-    cell = {name: found["summary"][name] for name in names_of_cell}
+    cell = {name: found["summary"][name] for name in ("SR", "SR_interval", "DR", "DR_interval", "PE")}
     cell |= {"success": found["rows"]["success"], "commit": find_commit()}
     result |= names
     result["cells"][str(steps)] = cell
@@ -126,16 +142,17 @@ def evaluate_cell(config: Config, path: Path, result: dict, steps: int) -> None:
     print(f"    SR {cell['SR']:.1f} %   DR {cell['DR']:.1f} %   PE {cell['PE']:.1f} mm", flush=True)
 
 
-def load_actor(config: Config, run: str, delay) -> tuple:
-    """Return the actor of a run, which bridges a delay where one is given, and the names of its row and policy."""
+def load_actor(config: Config, result: dict, delay) -> tuple:
+    """Return the actor of a result, which bridges a delay where one is given, and the names of its row and policy."""
     from dynmap_rl.modules.delayed_actor import DelayedActor
     from dynmap_rl.modules.policy import RecurrentPolicy
     from dynmap_rl.modules.supervision import row_name
     from dynmap_rl.runs.lookup import find_run, load_actor
+    from dynmap_rl.training.dataset import find_or_record
     from dynmap_rl.utils.devices import choose_device
 
-    folder = find_run(run)
-    if not (folder / "world_model").exists() and not any(folder.glob("seed_*")):
+    folder = find_run(result["run"])
+    if not has_world_model(folder):
         from dynmap_rl.integrations.lerobot import LeRobotActor
 
         actor = LeRobotActor(folder, cut=delay is not None)
@@ -143,7 +160,21 @@ def load_actor(config: Config, run: str, delay) -> tuple:
     actor = load_actor(folder, config.seed).to(choose_device(config.compute.device))
     kind = "recurrent" if isinstance(actor.policy, RecurrentPolicy) else "feedforward"
     names = {"row": row_name(actor.world_model.supervision), "policy": kind}
+    if result["condition"] == "past_actions":
+        names["policy"] = "feedforward"
+        dataset = find_or_record(result["task"], config.dataset)
+        return train_past_actions(folder, dataset, config.policy, config.seed), names
     return (DelayedActor(actor, max_delay=delay.longest) if delay else actor), names
+
+
+@cache
+def train_past_actions(folder: Path, dataset: str | Path, settings: PolicyTraining, seed: int):
+    """Train the policy with past actions on the world model of a run; one policy serves all delays."""
+    from dynmap_rl.modules.checkpoints import load_world_model
+    from dynmap_rl.paper.past_actions import make_past_actions_actor
+
+    world_model = load_world_model(folder / "world_model").requires_grad_(False)
+    return make_past_actions_actor(world_model, dataset, settings, seed)
 
 
 def write(config: Config) -> None:

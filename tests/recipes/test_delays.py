@@ -59,6 +59,15 @@ def test_cells_are_measured_once(grid, tmp_path):
     assert result.returncode == 2 and "another split" in result.stderr
 
 
+def test_the_baseline_with_past_actions_is_trained_on_the_run_s_world_model(grid, tmp_path, recording):
+    result = grid(
+        "--conditions", "past_actions", "--delays", "0,2", "--dataset", recording, "--policy.updates", 2
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    found = read_json(tmp_path / "found/balance_reaching_trained_seed_0_past_actions.json")
+    assert set(found["cells"]) == {"0", "2"} and found["policy"] == "feedforward"
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -67,6 +76,7 @@ def test_cells_are_measured_once(grid, tmp_path):
         (["--runs", "nothing"], "nothing"),
         (["--write"], "found must have results"),
         (["--eval.paper_episodes", "5"], "--eval.paper_episodes"),
+        (["--policy.kind", "recurrent"], "--policy.kind"),
     ],
 )
 def test_bad_input_gets_one_clear_line(grid, tmp_path, arguments, message):
