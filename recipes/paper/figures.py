@@ -48,13 +48,14 @@ def main(config: Config) -> None:
     from dynmap_rl.runs.folder import plain_settings
 
     names = [name.strip() for name in config.only.split(",")] if config.only else list(FIGURES)
-    if unknown := [name for name in names if name not in FIGURES]:
+    if unknown := sorted(set(names) - set(FIGURES)):
         raise ValueError(f"--only must be any of {', '.join(FIGURES)}, got {', '.join(unknown)}")
     datasets = name_datasets(config)
     drawn, missing = [], []
     for name in names:
         try:
             FIGURES[name][0](config, datasets)
+            print(f"written: {config.output / name}.png", flush=True)
             drawn.append(name)
         except ValueError as error:
             missing.append(f"{name}: {error}")
@@ -115,9 +116,8 @@ def draw_distributions(config: Config, datasets: dict) -> None:
 
     dynamics = {task: load_episodes(config, datasets, task, "train")["dynamics"] for task in datasets}
     ranges = plot_distributions(dynamics, config.output / "distributions.png")
-    made = {"command": command_line(sys.argv), "commit": find_commit()}
-    names = list(map(str, datasets.values()))
-    write_json(config.output / "distributions.json", made | {"datasets": names, "ranges": ranges})
+    facts = {"command": command_line(sys.argv), "commit": find_commit(), "ranges": ranges}
+    write_json(config.output / "distributions.json", facts | {"datasets": list(map(str, datasets.values()))})
 
 
 def draw_fig2(config: Config, datasets: dict) -> None:
