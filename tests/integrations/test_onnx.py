@@ -28,14 +28,14 @@ def exported(packages, tmp_path_factory):
 
 
 @torch.no_grad()
-def play(act, seeds):
-    """Return the actions ``[120, B, 3]`` of an actor in closed loop, and the final positions."""
+def play(driver, follower, seeds):
+    """Return the actions ``[120, 2, B, 3]`` of two actors on the frames of one closed loop, and the end's positions."""
     env = DynmapBatchedEnv("balance_reaching", len(seeds), from_pixels=True)
     td, actions = env.reset(scene_seed=torch.tensor(seeds)), []
     for _ in range(120):
-        action = act(td["pixels"], td["goal"])
-        actions.append(action)
-        td = env.step(td.set("action", action))["next"]
+        both = [act(td["pixels"], td["goal"]) for act in (driver, follower)]
+        actions.append(torch.stack(both))
+        td = env.step(td.set("action", both[0]))["next"]
     return torch.stack(actions), td["dynamics", "position"]
 
 
@@ -60,9 +60,12 @@ def test_parity_in_closed_loop_over_120_steps(exported):
     def act(pixels, goal):
         return torch.from_numpy(onnx.act(pixels.numpy(), goal.numpy()))
 
-    ours, theirs = play(in_pytorch(actor), seeds), play(act, seeds)
-    torch.testing.assert_close(theirs[0], ours[0], atol=1e-5, rtol=0)
-    torch.testing.assert_close(theirs[1], ours[1], atol=1e-5, rtol=0)
+    # On the same frames: separate loops part once a pixel differs, since tipping blocks amplify rounding errors.
+    actions, end = play(act, in_pytorch(actor), seeds)
+    torch.testing.assert_close(actions[:, 0], actions[:, 1], atol=1e-5, rtol=0)
+    assert actions.std() > 1e-3
+    _, other_end = play(in_pytorch(actor), in_pytorch(actor), seeds)
+    torch.testing.assert_close(end, other_end, atol=1e-2, rtol=0)  # m, rad
 
 
 @pytest.mark.slow
