@@ -1,6 +1,7 @@
 """Record expert demonstrations as a LeRobot dataset (paper, Sec. IV-C).
 
     python recipes/collect.py                                  # 300 + 50 demonstrations of task 1
+    python recipes/collect.py --kind undisturbed               # without noise and pushes
     python recipes/collect.py --kind exploration               # detours, noise and drops
     python recipes/collect.py --push_to_hub user/name
 
@@ -22,13 +23,14 @@ class Config:
     # Task: balance_reaching, balance_reaching_obstacle, bin_dropping, mujoco:FetchPush (FetchSlide, PlateSlide, Soccer),
     # or module:Class of your own.
     task: str = "balance_reaching"
-    # demonstrations (successful episodes only) or exploration (noisy experts on detours, all episodes).
+    # demonstrations (successful episodes only), undisturbed (such demonstrations without noise and pushes), or
+    # exploration (noisy experts on detours, all episodes).
     kind: str = "demonstrations"
     # Episodes of the split train.
     episodes: int = 300
     # Episodes of the split eval, held out.
     eval_episodes: int = 50
-    # Folder of the dataset; by default datasets/TASK, or datasets/TASK_exploration.
+    # Folder of the dataset; by default datasets/TASK, or datasets/TASK_KIND for the other kinds.
     output: Path | None = None
     # Folder of the expert's checkpoints (of a run of recipes/expert.py); by default the one that ships for the task.
     expert: Path | None = None

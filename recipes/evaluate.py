@@ -1,7 +1,7 @@
 """Evaluate a policy or an expert on a task's test scenes.
 
     python recipes/evaluate.py --policy balance_reaching                             # ships with the package
-    python recipes/evaluate.py --policy runs/decoupled/balance_reaching/position_velocity_recurrent
+    python recipes/evaluate.py --policy runs/decoupled/balance_reaching/position_velocity_recurrent --failures true
     python recipes/evaluate.py --policy runs/act/checkpoints/last/pretrained_model   # any LeRobot policy
     python recipes/evaluate.py --policy balance_reaching --delay 6 --jitter 2 --lost 0.1     # late and lost frames
     python recipes/evaluate.py --expert balance_reaching --task balance_reaching_obstacle
@@ -52,6 +52,8 @@ class Config:
     checkpoint: str | None = None
     # Evaluation in closed loop, here without the paper's protocol.
     eval: Evaluation = Evaluation(paper_episodes=0)
+    # Film failed episodes alone, where there are any.
+    failures: bool = False
     # Device, with --policy of a run, and cores.
     compute: Compute = Compute()
     # JSON file of the result; by default eval.json beside the page.
@@ -118,7 +120,7 @@ def judge_policy(config: Config) -> tuple[Path, str, dict]:
         parts += ["_".join(map(str, ["delay", *astuple(delay)])), *(["stale"] if config.stale else [])]
         result |= {"delay": asdict(delay), "stale": config.stale}
     folder = name_folder(config, get_task(task).name, *parts)
-    film_policy(actor, task, result["rows"], folder / "rollouts.gif", delay)
+    film_policy(actor, task, result["rows"], folder / "rollouts.gif", delay, config.failures)
     return folder, text, {"task": task, "policy": config.policy, **result}
 
 
@@ -189,7 +191,7 @@ def judge_expert(config: Config) -> tuple[Path, str, dict]:
         for name, rate in rates.items()
     ]
     folder = name_folder(config, task.name, *Path(expert).parts[-4:], checkpoint)
-    draw(failures_first(seeds, outcomes["success"]), folder / "rollouts.gif")
+    draw(failures_first(seeds, outcomes["success"], alone=config.failures), folder / "rollouts.gif")
     result = {"task": config.task or task.name, "expert": expert, "checkpoint": checkpoint}
     return folder, "\n".join(lines), result | {"rates": rates, "intervals": intervals}
 

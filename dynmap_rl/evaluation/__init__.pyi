@@ -1,6 +1,7 @@
 from .errors import judge_held_out as judge_held_out
 from .errors import policy_errors as policy_errors
 from .errors import prediction_errors as prediction_errors
+from .failures import failure_causes as failure_causes
 from .open_loop import open_loop_errors as open_loop_errors
 from .probing import probe as probe
 from .protocol import evaluate as evaluate
@@ -11,6 +12,7 @@ from .rollout import scene_seeds as scene_seeds
 from .settings import Evaluation as Evaluation
 from .statistics import rate_gap as rate_gap
 from .statistics import shared_interval as shared_interval
+from .statistics import student_interval as student_interval
 from .statistics import summarize as summarize
 from .statistics import summarize_seeds as summarize_seeds
 from .statistics import wilson as wilson

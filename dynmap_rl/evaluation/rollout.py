@@ -145,9 +145,16 @@ def episode_rows(episodes: TensorDict, seeds: list[int]) -> list[dict]:
     return rows
 
 
-def failures_first(seeds: Sequence[int], success: Sequence[bool], count: int = 8) -> list[int]:
-    """Return ``count`` scene seeds, failures first; half of them are failures if there are enough of both."""
+def failures_first(
+    seeds: Sequence[int], success: Sequence[bool], count: int = 8, alone: bool = False
+) -> list[int]:
+    """Return ``count`` scene seeds, failures first; half of them are failures if there are enough of both.
+
+    With ``alone``, they are failures alone, where there are any.
+    """
     pairs = list(zip(seeds, success, strict=True))
     failed, others = ([seed for seed, good in pairs if good == expected] for expected in (False, True))
+    if alone and failed:
+        return failed[:count]
     failed = failed[: max(count // 2, count - len(others))]
     return failed + others[: count - len(failed)]

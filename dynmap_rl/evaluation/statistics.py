@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
-from scipy.stats import binom, bootstrap, norm
+from scipy.stats import binom, bootstrap, norm, t
 
 
 def summarize(rows: list[dict]) -> dict[str, float]:
@@ -70,6 +72,23 @@ def shared_interval(rows_by_seed: list[list[dict]], outcome: str = "success") ->
     spread = values.mean(0).var(ddof=1) / starts if starts > 1 else 0.0
     count = np.clip(rate * (1 - rate) / spread, starts, values.size) if spread else starts
     return wilson(float(rate * count), float(count))
+
+
+def student_interval(rates: Sequence[float]) -> tuple[float, float] | None:
+    """Return the 95 % interval (Student's t) of the mean of rates, such as those of several world models.
+
+    Args:
+        rates: a rate for each, in %.
+
+    Returns:
+        The ends, within 0 and 100 %; None for fewer than two rates.
+    """
+    count = len(rates)
+    if count < 2:
+        return None
+    mean = float(np.mean(rates))
+    half = float(t.ppf(0.975, count - 1)) * float(np.std(rates, ddof=1)) / count**0.5
+    return max(mean - half, 0.0), min(mean + half, 100.0)
 
 
 def rate_gap(rows_a: list[list[dict]], rows_b: list[list[dict]], outcome: str = "success") -> dict:

@@ -72,7 +72,12 @@ def film_demonstrator(task: str, scene_seeds: Sequence[int], path: Path) -> None
 
 
 def film_policy(
-    actor: TensorDictModuleBase, task: str, rows: dict, path: Path, delay: FrameDelay | None = None
+    actor: TensorDictModuleBase,
+    task: str,
+    rows: dict,
+    path: Path,
+    delay: FrameDelay | None = None,
+    failures: bool = False,
 ) -> None:
     """Write eight evaluated episodes as an animation, failures first.
 
@@ -82,7 +87,9 @@ def film_policy(
         rows: ``rows`` of the result of :func:`dynmap_rl.evaluation.evaluate`.
         path: file to write.
         delay: delay of the frames in that evaluation.
+        failures: failures alone, where there are any.
     """
     rows = unpack_rows(rows)
-    some = failures_first([row["scene_seed"] for row in rows], [row["success"] for row in rows])
+    seeds, success = [row["scene_seed"] for row in rows], [row["success"] for row in rows]
+    some = failures_first(seeds, success, alone=failures)
     save_gif(roll_out(actor, task, some, True, delay)["pixels"], path)

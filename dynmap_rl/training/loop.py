@@ -18,7 +18,7 @@ from dynmap_rl.modules.precision import mixed_precision
 from dynmap_rl.runs.folder import load_training_state, save_training_state, truncate_metrics
 from dynmap_rl.runs.loggers import log_metrics
 
-from .settings import EndToEndTraining, WorldModelTraining
+from .settings import EndToEndTraining, WorldModelTraining, windows_at
 
 ADVICE = "the last saved state is kept; run again with a lower learning rate, in another --run"
 SAVE_EVERY = 250  # updates
@@ -70,7 +70,7 @@ def fit(
     progress = tqdm(range(start, settings.updates), folder.name, settings.updates, initial=start)
     for update in progress:
         set_learning_rate(optimizer, settings.learning_rate, update, settings.updates)
-        windows = sample_windows(episodes, *settings.windows_at(update), generator)
+        windows = sample_windows(episodes, *windows_at(settings, update), generator)
         windows = change_windows(windows, settings.augmentation, generator)
         with mixed_precision(device):
             losses = loss_module(windows)

@@ -73,12 +73,6 @@ class WorldModelTraining(WorldModelArchitecture):
             self, 0, "short_windows", "imagined", "learning_rate", "rarity", "beta_z", "beta_dynamics"
         )
 
-    def windows_at(self, update: int) -> tuple[int, int]:
-        """Return number and steps of the windows of an update."""
-        if update < self.short_windows * self.updates and self.window_steps > SHORT:
-            return max(1, self.windows * self.window_steps // SHORT), SHORT
-        return self.windows, self.window_steps
-
 
 @dataclass(frozen=True)
 class PolicyArchitecture:
@@ -125,6 +119,9 @@ class EndToEndTraining:
     windows: int = 8
     # Time steps of a window.
     window_steps: int = 48
+    # Share of the updates, at first, whose batches have the same number of frames in windows of 4 steps (see
+    # WorldModelTraining).
+    short_windows: float = 0.4
     # Peak learning rate (100 steps of warm-up, then a cosine).
     learning_rate: float = 2e-3
     # Extra weight of steps in which the expert changes its action (see imitation_loss); 0 is the paper's plain L1.
@@ -135,11 +132,7 @@ class EndToEndTraining:
     def __post_init__(self):
         check_at_least(self, 1, "updates", "windows")
         check_at_least(self, 2, "window_steps")
-        check_at_least(self, 0, "learning_rate", "emphasis")
-
-    def windows_at(self, update: int) -> tuple[int, int]:
-        """Return number and steps of the windows of an update, which are all the same."""
-        return self.windows, self.window_steps
+        check_at_least(self, 0, "short_windows", "learning_rate", "emphasis")
 
 
 @dataclass(frozen=True)
@@ -162,6 +155,13 @@ class JointTraining(EndToEndTraining):
         super().__post_init__()
         check_at_least(self, 1, "rgb_frames")
         check_at_least(self, 0, "rarity", "beta_z", "beta_dynamics", "beta_joint")
+
+
+def windows_at(settings: WorldModelTraining | EndToEndTraining, update: int) -> tuple[int, int]:
+    """Return number and steps of the windows of an update: at first many short ones, then the settings' own."""
+    if update < settings.short_windows * settings.updates and settings.window_steps > SHORT:
+        return max(1, settings.windows * settings.window_steps // SHORT), SHORT
+    return settings.windows, settings.window_steps
 
 
 @dataclass(frozen=True)

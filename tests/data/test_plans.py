@@ -96,6 +96,15 @@ def test_pushes_are_as_many_as_the_task_says_and_most_of_them_early(task):
     assert {plan.checkpoint for plan in plans} == set(list_checkpoints(task))
 
 
+def test_undisturbed_demonstrations_are_of_the_same_scenes_and_experts():
+    plans, same = (
+        plan_demonstrations("bin_dropping", "train", 5, 9, disturbed=some) for some in (True, False)
+    )
+    assert [(p.scene_seed, p.checkpoint) for p in plans] == [(p.scene_seed, p.checkpoint) for p in same]
+    assert any(p.noise and p.pushes for p in plans)
+    assert not any(p.noise or p.pushes for p in same)
+
+
 @pytest.mark.slow
 def test_expert_of_a_folder_is_recorded(tmp_path):
     """One shipped checkpoint in another folder, by another name, acts as ever."""

@@ -153,3 +153,12 @@ def test_settings_are_checked(settings, value):
 def test_half_of_what_is_shown_failed_where_that_many_did(failed, shown):
     assert failures_first(range(8), [seed not in failed for seed in range(8)], count=4) == shown
     assert failures_first([0, 1], [True, False], count=4) == [1, 0]
+
+
+def test_failures_alone_are_shown_where_there_are_any():
+    assert failures_first(range(8), [seed not in (1, 3, 4) for seed in range(8)], count=2, alone=True) == [
+        1,
+        3,
+    ]
+    assert failures_first(range(8), [seed != 5 for seed in range(8)], count=4, alone=True) == [5]
+    assert failures_first(range(3), [True] * 3, count=2, alone=True) == [0, 1]

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
-from scipy.stats import permutation_test
+from scipy.stats import permutation_test, ttest_1samp
 
 from dynmap_rl.evaluation.statistics import (
     exchange_p,
     rate_gap,
     shared_interval,
+    student_interval,
     summarize,
     summarize_seeds,
     wilson,
@@ -25,6 +26,14 @@ def test_rates_are_percentages_and_the_error_is_in_mm():
     summary = summarize(rows(6, dropped=2))
     assert (summary["SR"], summary["DR"], summary["episodes"]) == (60.0, 20.0, 10)
     assert summary["PE"] == pytest.approx(20.0)
+
+
+def test_students_interval_is_that_of_scipy_within_0_and_100():
+    rates = [50.0, 60.0, 70.0]
+    expected = ttest_1samp(rates, 0).confidence_interval(0.95)
+    assert student_interval(rates) == pytest.approx((expected.low, expected.high))
+    assert student_interval([90.0, 100.0]) == (pytest.approx(31.5, abs=0.1), 100.0)
+    assert student_interval([90.0]) is None
 
 
 def test_wilson_interval_is_the_textbook_one():

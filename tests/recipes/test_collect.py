@@ -10,6 +10,7 @@ from dynmap_rl.data.demonstrations import load_dataset
     ("arguments", "name"),
     [
         ([], "balance_reaching"),
+        pytest.param(["--kind", "undisturbed"], "balance_reaching_undisturbed", marks=pytest.mark.slow),
         pytest.param(
             ["--kind", "exploration", "--task", "bin_dropping"],
             "bin_dropping_exploration",

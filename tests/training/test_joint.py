@@ -6,7 +6,7 @@ from small import CONSTANTS, END_TO_END, JOINT, Stop, judge, load, make_episodes
 
 from dynmap_rl.modules.checkpoints import make_policy
 from dynmap_rl.runs.folder import read_metrics
-from dynmap_rl.training import PolicyArchitecture, WorldModelArchitecture, train_seeds
+from dynmap_rl.training import PolicyArchitecture, WorldModelArchitecture, loop, train_seeds
 from dynmap_rl.training import joint as module
 from dynmap_rl.training.joint import train_end_to_end, train_jointly
 from dynmap_rl.utils.devices import Compute
@@ -57,6 +57,36 @@ def test_a_killed_run_resumes_to_the_same_weights(tmp_path, monkeypatch):
     torch.manual_seed(5)
     train(tmp_path / "killed")
     assert read_weights(tmp_path / "killed") == read_weights(tmp_path / "whole")
+
+
+@pytest.mark.parametrize(("function", "settings"), [(train_jointly, JOINT), (train_end_to_end, END_TO_END)])
+def test_a_run_that_is_killed_among_short_windows_resumes_to_the_same_weights(
+    tmp_path, monkeypatch, function, settings
+):
+    sample, save, sizes = loop.sample_windows, loop.save_training_state, []
+
+    def sample_and_note(episodes, *size):
+        sizes.append(size[:2])
+        return sample(episodes, *size)
+
+    def save_then_stop(path, **state):
+        save(path, **state)
+        raise Stop
+
+    def train_again(folder):
+        model = make_model()
+        policy = make_policy(CONSTANTS, "recurrent", model, width=16)
+        function(model, policy, make_episodes(), folder, settings, save_every=2)
+        return fingerprint(model), fingerprint(policy)
+
+    monkeypatch.setattr(loop, "sample_windows", sample_and_note)
+    whole = train_again(tmp_path / "whole")
+    assert [steps for _, steps in sizes] == [4, 4, 4, 5, 5, 5]
+    with monkeypatch.context() as patch, pytest.raises(Stop):
+        patch.setattr(loop, "save_training_state", save_then_stop)
+        train_again(tmp_path / "killed")
+    assert train_again(tmp_path / "killed") == whole
+    assert [steps for _, steps in sizes[6:]] == [4, 4, 4, 5, 5, 5], "updates that were saved are not repeated"
 
 
 def test_a_finished_seed_is_left_alone(tmp_path, monkeypatch):

@@ -10,6 +10,7 @@ from dynmap_rl.data.settings import Augmentation
 from dynmap_rl.runs.folder import append_metrics, load_training_state, read_metrics
 from dynmap_rl.training import loop
 from dynmap_rl.training.loop import change_windows, check_loss
+from dynmap_rl.training.settings import EndToEndTraining, JointTraining, WorldModelTraining, windows_at
 from dynmap_rl.training.world_model import train_world_model
 from dynmap_rl.utils.weights import fingerprint
 
@@ -94,6 +95,14 @@ def test_a_gradient_that_is_not_finite_is_noticed_at_once():
     assert check_loss(2.0, torch.tensor(5.0), 3.0) == 3.0
     with pytest.raises(ValueError, match="not finite"):
         check_loss(2.0, torch.tensor(float("inf")))
+
+
+@pytest.mark.parametrize("kind", [WorldModelTraining, EndToEndTraining, JointTraining])
+def test_short_windows_come_first_and_hold_as_many_frames(kind):
+    settings = kind(updates=10, windows=3, window_steps=8, short_windows=0.4)
+    assert [windows_at(settings, update) for update in range(10)] == [(6, 4)] * 4 + [(3, 8)] * 6
+    assert windows_at(replace(settings, short_windows=0.0), 0) == (3, 8)
+    assert windows_at(replace(settings, window_steps=4), 0) == (3, 4)
 
 
 def test_windows_change_as_the_settings_say():

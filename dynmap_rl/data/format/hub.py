@@ -117,6 +117,9 @@ def draw_episodes(episodes: TensorDict, path: Path, rows: int = 3, columns: int 
         raise OSError(f"{path} cannot be written; is there space, and may the folder be written?")
 
 
+KINDS = {"human": "Demonstrations of a person", "undisturbed": "Undisturbed demonstrations"}
+
+
 def _describe(meta: dict, instruction: str) -> str:
     splits, task, kind = meta["splits"], meta["task"], meta["kind"]
     train, test = (end - first for first, end in (splits["train"], splits["eval"]))
@@ -127,11 +130,15 @@ def _describe(meta: dict, instruction: str) -> str:
             "state-based PPO experts act; all episodes succeed, two of three with noise, some with short pushes",
             collect,
         ),
+        "undisturbed": (
+            "state-based PPO experts act; all episodes succeed, without noise and pushes",
+            collect,
+        ),
         "exploration": ("state-based PPO experts act, with noise and detours", collect),
         "human": ("a person drives; all episodes succeed", f"play.py --task {task} --record FOLDER"),
     }[kind]
     return DESCRIPTION.format(
-        kind="Demonstrations of a person" if kind == "human" else kind.capitalize(),
+        kind=KINDS.get(kind, kind.capitalize()),
         task=task,
         instruction=instruction,
         episodes=len(meta["episodes"]),

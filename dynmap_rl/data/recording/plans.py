@@ -51,7 +51,12 @@ class Plan:
 
 
 def plan_demonstrations(
-    task: str, split: str, start: int, count: int, expert: str | Path | None = None
+    task: str,
+    split: str,
+    start: int,
+    count: int,
+    expert: str | Path | None = None,
+    disturbed: bool = True,
 ) -> list[Plan]:
     """Plan demonstrations with the checkpoints in turn; two of three episodes have noise, one of three pushes too.
 
@@ -63,14 +68,15 @@ def plan_demonstrations(
         start: number of the first scene in the split.
         count: number of episodes.
         expert: folder or task of the expert's checkpoints; by default the expert that ships for the task.
+        disturbed: whether there are noise and pushes.
     """
     checkpoints, pushed = find_checkpoints(task, expert), get_task(task).pushes
     plans = []
     for i in range(start, start + count):
         seed = scene_seed(split, i)
-        pushes = draw_pushes(seed, pushed) if i % 3 == 1 else ()
+        pushes = draw_pushes(seed, pushed) if disturbed and i % 3 == 1 else ()
         checkpoint = checkpoints[(i // 3) % len(checkpoints)]
-        plans.append(Plan(seed, checkpoint, noise=(0.0, 0.05, 0.1)[i % 3], pushes=pushes))
+        plans.append(Plan(seed, checkpoint, noise=disturbed * (0.0, 0.05, 0.1)[i % 3], pushes=pushes))
     return plans
 
 

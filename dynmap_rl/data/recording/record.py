@@ -23,7 +23,7 @@ from ..demonstrations import FORMAT, META, load_meta
 from .plans import find_checkpoints
 from .shards import Shard, merge_shards, record_shard
 
-KINDS = ("demonstrations", "exploration")
+KINDS = ("demonstrations", "undisturbed", "exploration")
 SHARD_EPISODES = 25
 
 
@@ -41,7 +41,8 @@ def record_dataset(
     Args:
         root: folder of the dataset; a complete recording with the same settings is left as it is.
         task: name of the task, or ``module:Class`` of your own.
-        kind: ``demonstrations`` (successful episodes only) or ``exploration`` (noise and detours, all episodes).
+        kind: ``demonstrations`` (successful episodes only), ``undisturbed`` (such demonstrations without noise and
+            pushes) or ``exploration`` (noise and detours, all episodes).
         episodes: number of episodes of the split ``train``.
         eval_episodes: number of episodes of the split ``eval``.
         workers: number of processes; 1 records in this process. A script that uses more must have the guard

@@ -156,14 +156,15 @@ def _roll_out_shard(shard: Shard) -> tuple[list[Plan], TensorDict]:
 
 def _count_rejected(shard: Shard) -> int:
     """Return how many candidates failed before the shard had its episodes; scenes are taken in order."""
-    if shard.kind != "demonstrations":
+    if shard.kind == "exploration":
         return 0
     first = _plan(shard, shard.number * CANDIDATES_PER_SHARD, 1)[0].scene_seed
     return read_json(shard.folder / ROWS, list)[-1]["scene_seed"] + 1 - first - shard.count
 
 
 def _plan(shard: Shard, start: int, count: int) -> list[Plan]:
-    if shard.kind == "demonstrations":
-        return plan_demonstrations(shard.task, shard.split, start, count, shard.expert)
+    if shard.kind != "exploration":
+        disturbed = shard.kind != "undisturbed"
+        return plan_demonstrations(shard.task, shard.split, start, count, shard.expert, disturbed)
     offset = EXPLORATION_EVAL_START if shard.split == "eval" else 0
     return plan_exploration(shard.task, "exploration", offset + start, count, shard.expert)
