@@ -6,31 +6,18 @@ import is slow, it creates folders for missing datasets, and it asks the network
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from numbers import Real
 from pathlib import Path
 
-import numpy as np
-import pyarrow as pa
-import torch
 from tensordict import TensorDict
 
 from dynmap_rl.envs.protocol import Layout
 from dynmap_rl.envs.task import LAYOUT
-from dynmap_rl.keys import CAMERAS, NEEDED, OPTIONAL
 from dynmap_rl.utils.files import check_form
 
-from .format.reading import (
-    choose_splits,
-    decode_image,
-    find_dataset,
-    image_files,
-    read_column,
-    read_info,
-    read_metadata,
-    read_split,
-    read_table,
-)
+from .cache import open_cached
+from .decoding import choose_columns, decode_episodes
+from .format.reading import choose_splits, find_dataset, read_info, read_metadata, read_split
 from .normalization import normalization_constants
 
 FORMAT = 4  # version of what is recorded, and how
@@ -53,8 +40,11 @@ LAYOUT_FORM = {
 }
 
 
-def load_dataset(dataset: str | Path, split: str | None = None, layout: Layout | None = None) -> TensorDict:
-    """Load all episodes of a LeRobot v3.0 dataset, or the episodes of a split, into memory.
+def load_dataset(dataset: str | Path, split: str | None = None, cache: Path | None = None) -> TensorDict:
+    """Load all episodes of a LeRobot v3.0 dataset, or the episodes of a split.
+
+    The first call decodes the dataset into a cache on disk (see :mod:`dynmap_rl.data.cache`), which the result maps into
+    memory: the operating system reads what is used, and processes share it. Changes of the result stay in this process.
 
     The result has TorchRL's episode data format (TED): observations and action of step t at the root, what follows the
     action under ``next``. Observations are not repeated under ``next``;
@@ -67,11 +57,11 @@ def load_dataset(dataset: str | Path, split: str | None = None, layout: Layout |
     Args:
         dataset: local folder, or id of a dataset on the Hugging Face hub (``user/name``).
         split: ``train``, ``eval``, or another split that the dataset's ``info.json`` names.
-        layout: sizes and names of the task; by default those that the recording names, otherwise those of the tasks of
-            cart and block.
+        cache: folder for decoded datasets; by default ``DATASET.cache`` beside the dataset.
 
     Returns:
-        ``[E, T]`` in SI units, numbers as float32, flags as bool. Sizes are those of the layout; of cart and block:
+        ``[E, T]`` in SI units, numbers as float32, flags as bool. Sizes are those of the recording's layout; of cart and
+        block:
 
         - ``pixels`` uint8 ``[E, T, 3, 64, 64]`` (frames of several cameras side by side), ``agent_pos`` ``[E, T, 5]``,
           ``goal`` ``[E, T, 2]`` (the last entries of ``agent_pos``), ``action`` ``[E, T, 3]``
@@ -89,16 +79,22 @@ def load_dataset(dataset: str | Path, split: str | None = None, layout: Layout |
         ValueError: the dataset is missing, damaged, or has another form.
     """
     root = find_dataset(dataset)
-    info, meta = read_info(root), find_meta(root)
-    layout = layout or find_layout(meta)
-    columns = _choose_columns(root, info, layout)
-    table = read_table(root, info, [*_cameras(layout), *columns.values()])
-    if split is not None:
-        table = _select_episodes(table, read_split(root, info, split))
-    return _build_episodes(root, info, table, columns, layout)
+    info = read_info(root)
+    members = None if split is None else read_split(root, info, split)
+    episodes = _open(root, info, find_meta(root), cache)
+    index = episodes["episode"][:, 0].tolist()
+    rows = sorted((e, row) for row, e in enumerate(index) if members is None or e in members)
+    rows = [row for _, row in rows]
+    if not rows:
+        raise ValueError(
+            f"split {split} of {root} must have an episode, got none; restore its meta/info.json"
+        )
+    if rows == list(range(rows[0], rows[-1] + 1)):
+        return episodes[rows[0] : rows[-1] + 1]
+    return episodes[rows]  # a copy, as a tensor is mapped as a whole
 
 
-def load_demonstrations(dataset: str | Path) -> tuple[dict[str, TensorDict], dict]:
+def load_demonstrations(dataset: str | Path, cache: Path | None = None) -> tuple[dict[str, TensorDict], dict]:
     """Load training and held-out episodes, with the constants of normalisation.
 
     A dataset without ``meta/dynmap.json``, such as one that LeRobot's tools have edited, is accepted: its constants are
@@ -107,6 +103,7 @@ def load_demonstrations(dataset: str | Path) -> tuple[dict[str, TensorDict], dic
 
     Args:
         dataset: local folder or hub id.
+        cache: see :func:`load_dataset`.
 
     Returns:
         The episodes by split, ``train`` and ``eval`` (see :func:`load_dataset`), and the constants (see
@@ -116,17 +113,33 @@ def load_demonstrations(dataset: str | Path) -> tuple[dict[str, TensorDict], dic
         ValueError: the dataset is missing, damaged, has another form, or fewer than two episodes.
     """
     root = find_dataset(dataset)
-    info = read_info(root)
-    meta = find_meta(root)
-    layout = find_layout(meta)
-    columns = _choose_columns(root, info, layout)
-    table = read_table(root, info, [*_cameras(layout), *columns.values()])
-    splits = choose_splits(root, info, np.unique(table["episode_index"].to_numpy()).tolist())
-    episodes = {
-        name: _build_episodes(root, info, _select_episodes(table, members), columns, layout)
-        for name, members in splits.items()
-    }
+    info, meta = read_info(root), find_meta(root)
+    parts = _open(root, info, meta, cache)
+    index = parts["episode"][:, 0].tolist()
+    splits = choose_splits(root, info, sorted(index))
+    episodes, start = {}, 0
+    for name, members in splits.items():  # in the order of the cache
+        episodes[name], start = parts[start : start + len(members)], start + len(members)
     return episodes, meta["normalization"] if meta else normalization_constants(episodes["train"])
+
+
+def _open(root: Path, info: dict, meta: dict | None, cache: Path | None) -> TensorDict:
+    """Open the decoded episodes: training episodes, held-out ones, then others."""
+    layout = find_layout(meta)
+    choose_columns(root, info, layout)  # so that messages do not depend on the cache
+
+    def order(episodes: list[int]) -> list[int]:
+        try:
+            splits = choose_splits(root, info, episodes)
+        except ValueError:  # too few for two splits
+            return episodes
+        chosen = [e for members in splits.values() for e in members]
+        return chosen + sorted(set(episodes) - set(chosen))
+
+    def build(allocate) -> None:
+        decode_episodes(root, info, layout, order, allocate=allocate)
+
+    return open_cached(root, layout.to_dict(), build, cache)
 
 
 def load_meta(dataset: str | Path) -> dict:
@@ -185,91 +198,3 @@ def find_layout(meta: dict | None) -> Layout:
         return LAYOUT
     check_form(meta["layout"], LAYOUT_FORM, f"{META}, layout")
     return Layout.from_dict(meta["layout"])
-
-
-def _cameras(layout: Layout) -> list[str]:
-    return [f"{CAMERAS}{camera}" for camera in layout.cameras]
-
-
-def _choose_columns(root: Path, info: dict, layout: Layout) -> dict:
-    """Return the columns to load, by key."""
-    features, cameras = info["features"], _cameras(layout)
-    if missing := [name for name in (*cameras, *NEEDED.values()) if name not in features]:
-        raise ValueError(
-            f"{root} must have the columns {', '.join(missing)}; add or rename them (dynamics.* are positions, "
-            "velocities and accelerations), or record a dataset with recipes/collect.py"
-        )
-    expected = layout.image_size, layout.image_size, 3
-    for name in cameras:
-        if (dtype := features[name]["dtype"]) != "image":
-            raise ValueError(f"{name} of {root} must be image, got {dtype}; record it with use_videos=False")
-        if (shape := tuple(features[name]["shape"])) != expected:
-            raise ValueError(
-                f"{name} of {root} must have the shape {expected}, got {shape}; resize the frames"
-            )
-    sizes = dict.fromkeys(OPTIONAL.values(), 1) | {"expert_action": len(layout.action)}
-    sizes |= {"observation.state": len(layout.state), "action": len(layout.action)}
-    sizes |= {f"dynamics.{quantity}": len(names) for quantity, names in layout.dynamics.items()}
-    for name, size in sizes.items():
-        if name in features and (shape := tuple(features[name]["shape"])) != (size,):
-            raise ValueError(
-                f"{name} of {root} must have the shape ({size},), got {shape}; train on other datasets with "
-                "recipes/robot.py"
-            )
-    return NEEDED | {key: name for key, name in OPTIONAL.items() if name in features}
-
-
-def _select_episodes(table: pa.Table, members: range | list[int]) -> pa.Table:
-    return table.filter(pa.array(np.isin(table["episode_index"].to_numpy(), members)))
-
-
-def _build_episodes(root: Path, info: dict, table: pa.Table, columns: dict, layout: Layout) -> TensorDict:
-    count, steps = shape = _episodes_and_steps(root, table)
-    data = {key: read_column(root, info, table, name).unflatten(0, shape) for key, name in columns.items()}
-    data["goal"] = data["agent_pos"][..., -layout.goal_size :].clone()
-    data["pixels"] = _decode_frames(root, table, layout).unflatten(0, shape)
-    never = torch.zeros(*shape, 1, dtype=torch.bool)
-    last = never.clone()
-    last[:, -1] = True
-    data["disturbed"] = data.get("disturbed", never).bool()
-    for flag, value in (("done", last), ("terminated", never), ("truncated", last)):
-        data[flag], data["next", flag] = never.clone(), value.clone()
-    data["episode"] = torch.tensor(table["episode_index"].to_numpy()).reshape(shape)
-    data["step_count"] = torch.arange(steps).repeat(count).reshape(count, steps, 1)
-    return TensorDict(data, shape)
-
-
-def _episodes_and_steps(root: Path, table: pa.Table) -> tuple[int, int]:
-    _, lengths = np.unique(table["episode_index"].to_numpy(), return_counts=True)
-    if not len(lengths) or lengths.min() != lengths.max():
-        found = f"{lengths.min()} to {lengths.max()} steps" if len(lengths) else "no episode"
-        raise ValueError(f"episodes of {root} must have equal lengths, got {found}; cut or remove some")
-    return len(lengths), int(lengths[0])
-
-
-def _decode_frames(root: Path, table: pa.Table, layout: Layout) -> torch.Tensor:
-    """Decode PNG files to uint8 ``[N, 3, H, W]`` in threads: the decoder releases the interpreter's lock."""
-    side, shape = layout.image_size, (layout.image_size, layout.image_size, 3)
-    pixels = np.empty((len(table), *layout.frame_shape), dtype=np.uint8)
-
-    def decode(rows: range, files: pa.Array, place: slice) -> None:
-        frames = np.empty((len(rows), *shape), dtype=np.uint8)
-        for i, row in enumerate(rows):
-            try:
-                frame = decode_image(files[row].as_buffer(), side * side)
-                if frame.shape != shape:
-                    raise ValueError(f"must have the shape {shape}, got {frame.shape}")
-            except ValueError as error:
-                raise ValueError(
-                    f"{root}: frame {row} {error}; restore the dataset or record it again"
-                ) from error
-            frames[i] = frame
-        # All at once: a sixth less time.
-        pixels[rows.start : rows.stop, ..., place] = frames.transpose(0, 3, 1, 2)
-
-    blocks = [range(i, min(i + 500, len(table))) for i in range(0, len(table), 500)]
-    with ThreadPoolExecutor() as pool:
-        for number, name in enumerate(_cameras(layout)):
-            files, place = image_files(root, name, table[name]), slice(side * number, side * (number + 1))
-            list(pool.map(lambda rows, files=files, place=place: decode(rows, files, place), blocks))
-    return torch.from_numpy(pixels)

@@ -9,7 +9,11 @@ from .augmentation import integers
 
 
 def sample_windows(
-    episodes: TensorDictBase, batch: int, length: int, generator: torch.Generator
+    episodes: TensorDictBase,
+    batch: int,
+    length: int,
+    generator: torch.Generator,
+    part: slice = slice(None),
 ) -> TensorDictBase:
     """Draw windows of episodes; every other window begins at the first step of its episode.
 
@@ -17,10 +21,11 @@ def sample_windows(
         episodes: ``[E, T]``.
         batch: number of windows B.
         length: steps of a window.
-        generator: source of the random numbers, on the device of the episodes.
+        generator: source of the random numbers.
+        part: windows of the batch that are wanted; the others are drawn but not copied.
 
     Returns:
-        Copies ``[batch, length]``.
+        Copies ``[batch, length]``, or as many as ``part`` selects.
 
     Raises:
         ValueError: the episodes are shorter than ``length``.
@@ -30,12 +35,13 @@ def sample_windows(
     episode = integers(0, count, (batch, 1), generator)
     start = integers(0, steps - length + 1, (batch, 1), generator)
     start[::2] = 0  # where memory is empty, as when control begins, and where most of the motion is
-    index = (episode * steps + start + torch.arange(length, device=generator.device)).flatten()
+    index = (episode * steps + start + torch.arange(length, device=generator.device))[part]
 
     def select(values: torch.Tensor) -> torch.Tensor:
-        return values.flatten(0, 1).index_select(0, index).unflatten(0, (batch, length))
+        flat = index.flatten().to(values.device)
+        return values.flatten(0, 1).index_select(0, flat).unflatten(0, index.shape)
 
-    return episodes.apply(select, batch_size=[batch, length])  # three times as fast as indexing
+    return episodes.apply(select, batch_size=index.shape)  # three times as fast as indexing
 
 
 def check_length(length: int, steps: int) -> None:

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import pickle
+from functools import partial
+
+import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from dynmap_rl.envs.delay import FrameDelay
 from dynmap_rl.modules.actor import Actor
 from dynmap_rl.modules.world_model import WorldModel
+from dynmap_rl.utils.processes import map_processes
 
 from .rollout import episode_rows, roll_out, scene_seeds
 from .settings import SHARED_STARTS, Evaluation
 from .statistics import summarize
 
 FLAGS = "success", "dropped", "touched"
+BATCH = 64  # episodes of a batch on a CPU, whose activations fit into the processor's cache
 
 
 def evaluate(
@@ -22,8 +28,9 @@ def evaluate(
     settings: Evaluation | None = None,
     delay: FrameDelay | None = None,
     pushed: bool = False,
+    workers: int = 1,
 ) -> dict[str, dict[str, dict]]:
-    """Evaluate an actor in closed loop; all episodes run as one batch.
+    """Evaluate an actor in closed loop: on a CPU in batches of 64 episodes, on a GPU in one batch.
 
     Args:
         actor: see :func:`dynmap_rl.evaluation.roll_out`.
@@ -31,19 +38,46 @@ def evaluate(
         settings: scenes to evaluate on; default :class:`Evaluation`.
         delay: delay of the frames; see :func:`dynmap_rl.evaluation.roll_out`, also for the next.
         pushed: push the cart.
+        workers: processes that share the batches of a CPU, each with one thread. The result does not depend on their
+            number. A script that uses more than one must have the guard ``if __name__ == "__main__"``.
 
     Returns:
         ``test`` on the shared start states and, if ``settings.paper_episodes`` is not 0, ``paper`` on others. Each has
         ``summary`` (see :func:`dynmap_rl.evaluation.summarize`) and ``rows`` (see :func:`pack_rows`).
+
+    Raises:
+        OSError: a process died.
     """
     settings = settings or Evaluation()
     seeds = scene_seeds(settings.split, settings.episodes)
     seeds += scene_seeds(settings.split, settings.paper_episodes, start=SHARED_STARTS)
-    rows = episode_rows(roll_out(actor, task, seeds, delay=delay, pushed=pushed), seeds)
+    run = partial(roll_out, task=task, delay=delay, pushed=pushed)
+    if next(actor.parameters()).device.type == "cpu":
+        rows = _judge_batches(actor, run, seeds, workers)
+    else:
+        rows = episode_rows(run(actor, seeds=seeds), seeds)
     parts = {"test": rows[: settings.episodes], "paper": rows[settings.episodes :]}
     return {
         name: {"summary": summarize(part), "rows": pack_rows(part)} for name, part in parts.items() if part
     }
+
+
+def _judge_batches(actor: TensorDictModuleBase, run: partial, seeds: list[int], workers: int) -> list[dict]:
+    """Return the rows of all scenes, a batch after the other or in several processes."""
+    batches = [seeds[start : start + BATCH] for start in range(0, len(seeds), BATCH)]
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # a sum's last bit may depend on the threads
+    try:
+        judge = partial(_judge_batch, pickle.dumps(actor), run)
+        parts = map_processes(judge, batches, workers, f"{len(seeds)} episodes")
+    finally:
+        torch.set_num_threads(threads)
+    return [row for part in parts for row in part]
+
+
+def _judge_batch(actor: bytes, run: partial, seeds: list[int]) -> list[dict]:
+    torch.set_num_threads(1)
+    return episode_rows(run(pickle.loads(actor), seeds=seeds, progress=False), seeds)
 
 
 def judge_in_closed_loop(

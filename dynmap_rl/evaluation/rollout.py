@@ -35,6 +35,7 @@ def roll_out(
     keep_pixels: bool = False,
     delay: FrameDelay | None = None,
     pushed: bool = False,
+    progress: bool = True,
 ) -> TensorDict:
     """Run one episode of T steps (120 of cart and block) for each scene; an episode goes on after a failure.
 
@@ -50,6 +51,7 @@ def roll_out(
             gets every frame that arrives; any other actor gets the newest that has arrived.
         pushed: execute pushes in the place of some actions, which the actor is not told. They are as many and as strong
             as in disturbed demonstrations, and the same for the same scenes.
+        progress: show a progress bar.
 
     Returns:
         A TensorDict ``[E, T]`` with ``action``, ``goal`` and ``dynamics`` at t, ``pixels`` if they are kept, and
@@ -60,12 +62,12 @@ def roll_out(
     rules, device = get_task(task), next(actor.parameters()).device
     size = min(len(seeds), rules.max_worlds or len(seeds))
     env = DynmapBatchedEnv(task, size, from_pixels=True, include_state=False, device=device)
-    parts = []
+    parts, title = [], f"{len(seeds)} episodes" if progress else None
     for start in range(0, len(seeds), size):
         some = seeds[start : start + size]
         full = some + seeds[: size - len(some)]  # a batch always has the same size
         plans = [Plan(seed, "", pushes=draw_pushes(seed, rules.pushes * pushed)) for seed in full]
-        episodes = _roll_out(actor, env, plans, keep_pixels, delay, f"{len(seeds)} episodes")
+        episodes = _roll_out(actor, env, plans, keep_pixels, delay, title)
         parts.append(episodes[: len(some)])
     return torch.cat(parts)
 
@@ -76,7 +78,7 @@ def _roll_out(
     plans: list[Plan],
     keep_pixels: bool,
     delay: FrameDelay | None,
-    title: str,
+    title: str | None,
 ) -> TensorDict:
     """Run one episode in every world of an environment by scene and pushes of its plan, ``[E, T]``."""
     if hasattr(actor, "reset"):  # a LeRobot policy keeps its memory itself
@@ -92,7 +94,7 @@ def _roll_out(
     sizes = {q: len(env.layout.dynamics[q]) for q in (world_model.supervision if world_model else ())}
     predicted = {quantity: torch.zeros(count, size, device=device) for quantity, size in sizes.items()}
     pushed, steps = any(plan.pushes for plan in plans), []
-    for t in tqdm(range(env.layout.steps), title, unit="step", leave=False):
+    for t in tqdm(range(env.layout.steps), title, unit="step", leave=False, disable=title is None):
         dynamics = env.read_dynamics()
         td = actor(td)
         if pushed:

@@ -139,14 +139,14 @@ class GlimpseEncoder(Encoder):
         # One row of memory for each map: SUB x SUB places in a block, then the blocks.
         logits = self.attend(h).float().contiguous().view(count, self.maps, -1)  # (N, K, S^2 / 4)
         attention = (logits + _rarity(x)).softmax(-1)
-        colors = blocks.permute(0, 2, 3, 1).flatten(1, 2).float() @ (self.average / 255) - 0.5
+        colors = blocks.permute(0, 2, 3, 1).flatten(1, 2) @ (self.average / 255) - 0.5
         colors = colors.view(count, -1, SUB**2, 3).transpose(1, 2).reshape(count, -1, 3)
         mean = colors.mean(1)
         where = attention @ torch.cat([self.places.expand(count, -1, -1), colors], -1)  # (N, K, 5)
         of_blocks = attention.view(count, self.maps, SUB**2, -1).sum(2)  # (N, K, S^2 / 16)
         features = self.features(h).permute(0, 2, 3, 1).flatten(1, 2).float()
         what = of_blocks @ features  # (N, K, features)
-        glimpses = self.look(x.float(), where[:, : self.glimpses, :2], 255 * (mean + 0.5)) / 255
+        glimpses = self.look(x, where[:, : self.glimpses, :2], 255 * (mean + 0.5)) / 255
         values = 2 * where.flatten(1), what.flatten(1), 3 * mean, self.read(2 * glimpses.flatten(1))
         pooled = torch.cat(values, -1)
         return self.mlp(pooled) + self.linear(pooled)
@@ -174,7 +174,12 @@ class GlimpseEncoder(Encoder):
         """
         size = self.image_size
         across, down = hat_kernels(centers, self.samples, self.spacing, size).unbind(2)  # (N, G, samples, S)
-        rows = down.flatten(1, 2) @ x.transpose(1, 2).flatten(2)  # (N, G samples, 3 S)
+        autocast = torch.is_autocast_enabled(x.device.type)
+        dtype = torch.get_autocast_dtype(x.device.type) if autocast else down.dtype
+        lines = (
+            x.transpose(1, 2).flatten(2).to(dtype)
+        )  # (N, S, 3 S); moving bytes is cheaper than moving floats
+        rows = down.flatten(1, 2) @ lines  # (N, G samples, 3 S)
         rows = rows.view(*centers.shape[:2], -1, size)  # (N, G, samples * 3, S)
         seen = (rows @ across.mT).unflatten(2, (-1, 3))
         # (N, G, samples, 1, samples)

@@ -6,7 +6,6 @@ fingerprint of the world model is the same before and after.
 
 from __future__ import annotations
 
-import errno
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -26,7 +25,7 @@ from dynmap_rl.modules.checkpoints import (
 )
 from dynmap_rl.modules.world_model import WorldModel
 from dynmap_rl.utils.devices import Compute, choose_device, seed_everything
-from dynmap_rl.utils.files import read_json, write_json
+from dynmap_rl.utils.files import check_space, read_json, write_json
 from dynmap_rl.utils.processes import run_processes
 from dynmap_rl.utils.weights import fingerprint
 
@@ -123,12 +122,6 @@ def _write_features(world_model, episodes, states: Path, device: str) -> None:
     check_space(states.parent, train.bytes() + held_out.bytes())
     for name, values in (("train", train), ("eval", held_out)):
         values.cpu().memmap(states / name)
-
-
-def check_space(folder: Path, size: int) -> None:
-    """Raise ``OSError`` if ``size`` bytes do not fit: a process that maps a file into memory would be killed."""
-    if (free := shutil.disk_usage(folder).free) < size:
-        raise OSError(errno.ENOSPC, f"{size / 1e6:.0f} MB are needed, {free / 1e6:.0f} are free", str(folder))
 
 
 def _train(arguments: tuple[_Work, int]) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import shutil
 from pathlib import Path
 
 LOCKS = {}  # locks of this process by path; a lock is released when nothing refers to it
@@ -75,6 +77,12 @@ def check_form(value, form, where: str) -> None:
     elif isinstance(form, dict):
         for name in value if str in form else form:
             check_form(value.get(name), form.get(name, form.get(str)), f"{where}, {name}")
+
+
+def check_space(folder: Path, size: int) -> None:
+    """Raise ``OSError`` if ``size`` bytes do not fit: a process that maps a file into memory would be killed."""
+    if (free := shutil.disk_usage(folder).free) < size:
+        raise OSError(errno.ENOSPC, f"{size / 1e6:.0f} MB are needed, {free / 1e6:.0f} are free", str(folder))
 
 
 def lock_folder(folder: Path) -> None:

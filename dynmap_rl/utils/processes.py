@@ -50,6 +50,52 @@ def run_processes(stages: Sequence[Callable[[tuple], None]], arguments: list[tup
             raise
 
 
+def map_processes(function: Callable, arguments: Sequence, count: int, title: str | None = None) -> list:
+    """Return ``function(argument)`` for each argument, computed by this process and ``count - 1`` others.
+
+    The others take from the front of the sequence and this process from its end, so that it works while they start.
+
+    Args:
+        function: picklable function.
+        arguments: what the function is called with.
+        count: number of processes.
+        title: title of a progress bar.
+
+    Raises:
+        OSError: a process died.
+    """
+    from tqdm import tqdm
+
+    with tqdm(total=len(arguments), desc=title, leave=False, disable=title is None) as progress:
+
+        def call(argument):
+            value = function(argument)
+            progress.update()
+            return value
+
+        if min(count, len(arguments)) <= 1:
+            return [call(one) for one in arguments]
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(count - 1, mp_context=context, initializer=start_worker) as pool:
+            try:
+                futures = [pool.submit(function, one) for one in arguments]
+                pairs = zip(arguments[::-1], futures[::-1], strict=True)
+                own = [call(one) for one, future in pairs if future.cancel()]  # not taken by another process
+                values = []
+                for future in futures:
+                    if future.cancelled():
+                        values.append(own.pop())
+                    else:
+                        values.append(future.result())
+                        progress.update()
+                return values
+            except BrokenProcessPool as error:
+                raise OSError("a process died, perhaps for want of memory; use fewer threads") from error
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+
+
 def start_worker() -> None:
     """End this process silently on Ctrl-C, and when its parent ends, even by a kill."""
     from tqdm import tqdm

@@ -132,7 +132,7 @@ def evaluate_cell(config: Config, path: Path, result: dict, steps: int) -> None:
     _, _, pushed, stale = CONDITIONS[result["condition"]]
     delay = frame_delay(result["condition"], steps)
     actor, names = load_actor(config, result, None if stale else delay)
-    found = evaluate(actor, result["task"], config.eval, delay, pushed)["test"]
+    found = evaluate(actor, result["task"], config.eval, delay, pushed, config.compute.threads)["test"]
     cell = {name: found["summary"][name] for name in ("SR", "SR_interval", "DR", "DR_interval", "PE")}
     cell |= {"success": found["rows"]["success"], "commit": find_commit()}
     result |= names

@@ -117,6 +117,16 @@ def test_both_protocols_on_their_own_scenes():
     assert judge_in_closed_loop(actor.world_model, actor.policy, "bin_dropping", settings) == result
 
 
+@pytest.mark.slow
+def test_the_result_does_not_depend_on_the_number_of_processes(monkeypatch):
+    monkeypatch.setattr("dynmap_rl.evaluation.protocol.BATCH", 1)
+    actor, settings, delay = make_actor(), Evaluation(episodes=4, paper_episodes=1), FrameDelay(2, 1)
+    alone, shared = (
+        evaluate(actor, "balance_reaching", settings, delay, pushed=True, workers=n) for n in (1, 2)
+    )
+    assert alone == shared
+
+
 def test_rows_survive_their_packing(rolled):
     _, seeds, episodes = rolled
     rows = episode_rows(episodes, seeds)

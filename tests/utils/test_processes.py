@@ -1,14 +1,16 @@
 """Stages in processes: their order, their errors, and processes that die."""
 
 import importlib
+import os
 import sys
 
 import pytest
 
-from dynmap_rl.utils.processes import run_processes, run_script
+from dynmap_rl.utils.processes import map_processes, run_processes, run_script
 
 STAGES = """
 import os
+import time
 
 def first(argument):
     folder, number = argument
@@ -23,6 +25,18 @@ def second(argument):
 
 def third(argument):
     os._exit(1)
+
+def square(number):
+    if number == 100:
+        time.sleep(1)  # until the others have taken their share
+    if number < 0:
+        raise ValueError("this one is negative")
+    return number**2, os.getpid()
+
+def third_of(own):
+    time.sleep(1)  # this process works on its own share
+    if os.getpid() != own:
+        os._exit(1)
 """
 
 
@@ -54,6 +68,24 @@ def test_an_error_in_a_process_is_raised(tmp_path, stages, count):
 def test_a_process_that_dies_is_an_error(tmp_path, stages):
     with pytest.raises(OSError, match="a process died"):
         run_processes([stages.first, stages.third], [(tmp_path, 0), (tmp_path, 1)], 2)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_values_come_in_the_order_of_their_arguments(stages, count):
+    values = map_processes(stages.square, [*range(20), 100], count)
+    assert [value for value, _ in values] == [n**2 for n in (*range(20), 100)]
+    assert (len({process for _, process in values}) > 1) == (count > 1)
+
+
+@pytest.mark.parametrize("numbers", [[-1, 1, 2, 100], [1, 2, 3, -1]])
+def test_an_error_in_a_call_is_raised(stages, numbers):
+    with pytest.raises(ValueError, match="negative"):
+        map_processes(stages.square, numbers, 2)
+
+
+def test_a_process_that_dies_in_a_call_is_an_error(stages):
+    with pytest.raises(OSError, match="a process died"):
+        map_processes(stages.third_of, [os.getpid()] * 3, 2)
 
 
 def test_a_script_runs_with_its_arguments_in_its_folder(tmp_path):

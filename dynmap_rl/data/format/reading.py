@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
@@ -169,19 +170,29 @@ def read_file(file: Path, columns: list[str]) -> pa.Table:
     return table
 
 
-def read_table(root: Path, info: dict, columns: list[str]) -> pa.Table:
+def iterate_tables(root: Path, columns: list[str]) -> Iterator[pa.Table]:
+    """Read columns of one data file after the other, with ``index`` and ``episode_index``.
+
+    Raises:
+        ValueError: a file is damaged, or lacks a column.
+    """
+    for file in sorted((root / "data").glob("*/*.parquet")):
+        yield read_file(file, ["index", "episode_index", *columns])
+
+
+def read_table(root: Path, info: dict, columns: list[str], by_time: bool = True) -> pa.Table:
     """Read columns of all data files, with ``index`` and ``episode_index``, in order of time.
 
     Args:
         root: folder of the dataset.
         info: content of its ``meta/info.json``.
         columns: names of the columns.
+        by_time: sort by ``index``; otherwise the order is that of the files.
 
     Raises:
         ValueError: a file is damaged, or columns or frames are missing.
     """
-    files = sorted((root / "data").glob("*/*.parquet"))
-    tables = [read_file(file, ["index", "episode_index", *columns]) for file in files]
+    tables = list(iterate_tables(root, columns))
     try:
         table = pa.concat_tables(tables) if tables else []
     except pa.ArrowException as error:
@@ -192,7 +203,7 @@ def read_table(root: Path, info: dict, columns: list[str]) -> pa.Table:
         raise ValueError(
             f"{root} must have {info['total_frames']} frames, got {len(table)}; restore it or record it again"
         )
-    return table.sort_by("index")
+    return table.sort_by("index") if by_time else table
 
 
 def read_column(root: Path, info: dict, table: pa.Table, name: str, dtype=np.float32) -> torch.Tensor:

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from dynmap_rl.envs.protocol import Layout
 from dynmap_rl.keys import CAMERAS
 
-from ..demonstrations import load_dataset
+from ..decoding import decode_episodes
 from .quiet import quiet
 from .reading import read_column, read_info, read_table
 
@@ -71,7 +71,7 @@ def write_episodes(folder: Path, episodes: TensorDict, instruction: str, layout:
             with _without_cache():
                 dataset.save_episode()
         dataset.finalize()
-    written = load_dataset(folder, layout=layout)
+    written = decode_episodes(folder, read_info(folder), layout)
     # LeRobot only logs a frame that could not be written.
     for key in ("pixels", "agent_pos", "action", "dynamics", "disturbed", "expert_action"):
         if not (written[key] == episodes[key]).all():
@@ -90,7 +90,7 @@ def merge_datasets(
         layout: sizes and names of the task.
 
     Returns:
-        All episodes, as :func:`dynmap_rl.data.load_dataset` returns them.
+        All episodes without their frames, otherwise as :func:`dynmap_rl.data.load_dataset` returns them.
     """
     with quiet(), _without_cache():
         import datasets
@@ -105,7 +105,7 @@ def merge_datasets(
         write_info(info, into)
         stats = load_stats(into) | _compute_stats(into, layout)
         write_stats({name: stats[name] for name in sorted(stats)}, into)
-    return load_dataset(into, layout=layout)
+    return decode_episodes(into, read_info(into), layout, pixels=False)
 
 
 def _to_columns(episodes: TensorDict, layout: Layout) -> dict[str, np.ndarray]:

@@ -1,0 +1,123 @@
+"""Decoded episodes on disk, mapped into memory: for data larger than memory, and shared by processes.
+
+A cache is a folder ``DATASET.cache`` beside the dataset's folder, or in a folder that the user names. It holds one entry,
+named after the dataset's content and written by TensorDict, which appears when it is complete.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import shutil
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import torch
+from filelock import FileLock
+from tensordict import TensorDict
+
+from dynmap_rl.utils.files import check_space
+
+FORMAT = 1  # of the entries
+Allocate = Callable[[str | tuple[str, str], tuple[int, ...], torch.dtype], torch.Tensor]
+
+
+def open_cached(
+    root: Path, settings: object, build: Callable[[Allocate], None], cache: Path | None = None
+) -> TensorDict:
+    """Open the decoded episodes of a dataset, which are built where they are missing or stale.
+
+    Other processes wait for the one that builds. Entries of other content or settings are deleted.
+
+    Args:
+        root: folder of the dataset.
+        settings: JSON values on which the result depends beside the dataset's files.
+        build: function that decodes the dataset into tensors. It gets a function of key, shape and dtype that returns a
+            tensor on disk.
+        cache: folder for the caches of several datasets; by default the cache lies beside the dataset.
+
+    Returns:
+        What was built. Changes of its tensors stay in this process.
+
+    Raises:
+        OSError: the cache cannot be written, or the disk is full.
+    """
+    place = _find_place(root.resolve(), cache)
+    name = _hash_content(root, settings)
+    entry = place / name
+    try:
+        if not entry.exists():
+            place.mkdir(parents=True, exist_ok=True)
+            with FileLock(place / ".lock"):
+                if not entry.exists():
+                    _build(entry, build)
+                    for other in place.iterdir():
+                        if other.is_dir() and other != entry:
+                            shutil.rmtree(other, ignore_errors=True)
+        return _map(entry)
+    except OSError as error:
+        if error.errno is None:
+            raise
+        message = f"cannot cache {root} in {place} ({error.strerror}); choose another folder with --cache"
+        raise OSError(message) from error
+
+
+def _find_place(root: Path, cache: Path | None) -> Path:
+    if cache is None:
+        return root.with_name(f"{root.name}.cache")
+    path = hashlib.sha256(str(root).encode()).hexdigest()[:8]  # datasets may have the same name
+    return Path(cache).expanduser() / f"{root.name}_{path}"
+
+
+def _hash_content(root: Path, settings: object) -> str:
+    """Return a name that depends on the settings and on every byte of the data files and of the metadata."""
+    files = [root / "meta/info.json", *sorted((root / "data").glob("*/*.parquet"))]
+
+    def digest(path: Path) -> bytes:
+        with open(path, "rb") as file:
+            return hashlib.file_digest(file, "sha256").digest()
+
+    with ThreadPoolExecutor() as pool:  # hashing releases the interpreter's lock
+        digests = list(pool.map(digest, files))
+    names = [path.relative_to(root).as_posix() for path in files]
+    head = json.dumps([FORMAT, settings, names]).encode()
+    return hashlib.sha256(b"".join([head, *digests])).hexdigest()[:16]
+
+
+def _build(entry: Path, build: Callable[[Allocate], None]) -> None:
+    temporary = entry.with_name(f"{entry.name}.tmp")
+    try:
+        for leftover in entry.parent.glob("*.tmp"):  # of a killed process
+            shutil.rmtree(leftover)
+        episodes = TensorDict({}).memmap_(temporary)
+
+        def allocate(key, shape, dtype) -> torch.Tensor:
+            size = math.prod(shape) * dtype.itemsize
+            check_space(temporary, size)
+            values = episodes.make_memmap(key, shape, dtype=dtype)
+            if size and hasattr(
+                os, "posix_fallocate"
+            ):  # a full disk would otherwise kill the process that writes
+                with open(values.filename, "r+b") as file:
+                    os.posix_fallocate(file.fileno(), 0, size)
+            return values
+
+        build(allocate)
+        temporary.replace(entry)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _map(entry: Path) -> TensorDict:
+    """Map an entry. Pages that are changed are copied, so that the files stay as they are."""
+
+    def private(values: torch.Tensor) -> torch.Tensor:
+        flat = torch.from_file(str(values.filename), shared=False, size=values.numel(), dtype=values.dtype)
+        return flat.view(values.shape)
+
+    episodes = TensorDict.load_memmap(entry)
+    data = {key: private(episodes.get(key)) for key in episodes.keys(True, True)}
+    return TensorDict(data, data["action"].shape[:2])
