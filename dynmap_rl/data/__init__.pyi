@@ -1,4 +1,3 @@
-from .augmentation import add_distractors as add_distractors
 from .augmentation import augment as augment
 from .demonstrations import load_dataset as load_dataset
 from .demonstrations import load_demonstrations as load_demonstrations

@@ -17,13 +17,11 @@ class Augmentation:
     mirror: bool = True
     # Largest shift of a window, in pixels.
     max_shift: int = 6
-    # Largest number of bars painted on the background of a window.
-    distractors: int = 3
 
     def __post_init__(self):
-        check_at_least(self, 0, "max_shift", "distractors")
+        check_at_least(self, 0, "max_shift")
 
     @classmethod
     def off(cls) -> Augmentation:
         """Return the settings without any change."""
-        return cls(recolor=False, mirror=False, max_shift=0, distractors=0)
+        return cls(recolor=False, mirror=False, max_shift=0)

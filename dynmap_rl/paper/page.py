@@ -69,7 +69,7 @@ the effective number of independent episodes, since a scene that is hard for one
 
 ## What world models see
 
-One-step predictions of two datasets without distractors: held-out demonstrations, and the expert's first ten steps in
+One-step predictions of two datasets: held-out demonstrations, and the expert's first ten steps in
 validation scenes, where the cart is away from the goal. Colour error: root mean square on the pixels of cart and block (of
 0 to 1). Chroma: share of the variation of the objects' chroma that is explained. Goal: share of the marker's difference
 from the background. Background: root mean square error on all other pixels. Cart: distance of a linear map of the latent.

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torch import nn
 from tqdm import tqdm
 
-from dynmap_rl.data.augmentation import add_distractors, augment
+from dynmap_rl.data.augmentation import augment
 from dynmap_rl.data.settings import Augmentation
 from dynmap_rl.data.windows import sample_windows
 from dynmap_rl.modules.precision import mixed_precision
@@ -99,8 +99,6 @@ def change_windows(
     """Apply the augmentations of the settings to windows ``[B, T]``."""
     if settings.recolor or settings.mirror or settings.max_shift:
         windows = augment(windows, generator, settings.max_shift, settings.mirror, settings.recolor)
-    if settings.distractors:
-        windows = add_distractors(windows, generator, settings.distractors)
     return windows
 
 

@@ -1,10 +1,9 @@
-"""Augmentations are symmetries of the scene; distractors change its background and nothing else."""
+"""Augmentations are symmetries of the scene."""
 
 import numpy as np
-import pytest
 import torch
 
-from dynmap_rl.data.augmentation import add_distractors, augment
+from dynmap_rl.data.augmentation import augment
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 
 
@@ -64,73 +63,3 @@ def test_options_leave_the_other_changes_as_they_are():
     assert torch.equal(every["pixels"].sum(2), same_colors["pixels"].sum(2)), "channels are permuted"
     off = augment(episodes, torch.Generator(), max_shift=0, mirror=False, recolor=False)
     assert (off == episodes.select(*off.keys())).all()
-
-
-# Distractors
-
-
-@pytest.fixture(scope="module")
-def windows():
-    """40 windows in which cart and block move over the background."""
-    return make_episodes(num_envs=40, steps=15)
-
-
-def distract(windows, seed: int = 0, **arguments):
-    return add_distractors(windows, torch.Generator().manual_seed(seed), **arguments)
-
-
-def is_background(pixels):
-    """``[B, T, H, W]``: nothing is ever in the upper left corner."""
-    return (pixels == pixels[..., :1, :1]).all(2)
-
-
-def test_distractors_change_background_pixels_only(windows):
-    changed = (distract(windows)["pixels"] != windows["pixels"]).any(2)
-    assert not (changed & ~is_background(windows["pixels"])).any()
-    assert 15 < changed.flatten(1).any(1).sum() < 40  # some windows get none
-
-
-def test_distractors_are_at_rest(windows):
-    """A pixel that is background in several frames has the same value in all of them, changed or not."""
-    for before, after in zip(windows["pixels"], distract(windows)["pixels"], strict=True):
-        free = is_background(before[None])[0].unsqueeze(1)
-        lowest = torch.where(free, after, 255).amin(0)
-        highest = torch.where(free, after, 0).amax(0)
-        seen = free.any(0).expand_as(lowest)
-        assert torch.equal(lowest[seen], highest[seen])
-    hidden = is_background(windows["pixels"]).float().mean(1)
-    assert ((hidden > 0) & (hidden < 1)).flatten(1).any(1).all()
-
-
-def test_distractors_of_a_window_have_one_vivid_colour(windows):
-    colors = set()
-    for before, after in zip(windows["pixels"], distract(windows)["pixels"], strict=True):
-        changed = (before != after).any(1)
-        new = after.permute(0, 2, 3, 1)[changed].unique(dim=0)
-        assert len(new) <= 1
-        colors |= {tuple(color) for color in new.tolist()}
-    assert len(colors) > 15
-    assert all(max(color) - min(color) >= 100 for color in colors)
-
-
-def test_distractors_are_determined_by_the_generator(windows):
-    assert (distract(windows, 3) == distract(windows, 3)).all()
-    assert not torch.equal(distract(windows, 3)["pixels"], distract(windows, 4)["pixels"])
-
-
-def test_number_of_distractors_is_bounded(windows):
-    assert torch.equal(distract(windows, most=0)["pixels"], windows["pixels"])
-    changed = [(distract(windows, most=most)["pixels"] != windows["pixels"]).sum() for most in (1, 3, 9, 60)]
-    assert changed == sorted(changed) and changed[0] < 0.7 * changed[2]
-    one = (distract(windows, most=1)["pixels"] != windows["pixels"]).any(2).any(1)
-    assert one.flatten(1).sum(1).max() <= 4 * 24  # of a single bar
-
-
-def test_distractors_leave_the_rest_and_the_input_alone(windows):
-    before = windows.clone()
-    out = distract(windows)
-    assert (windows == before).all()
-    assert set(out.keys(True, True)) == set(windows.keys(True, True))
-    assert (out.exclude("pixels") == windows.exclude("pixels")).all()
-    out["pixels"].zero_()
-    assert (windows == before).all()

@@ -49,7 +49,7 @@ def test_a_run_measures_held_out_errors(datasets, tmp_path, method, arguments, g
     assert evaluation["trained_on"]["held_out_episodes"] == [2]
     assert evaluation["world_model"] == {"training": method, "dataset": str(datasets / "gliding")}
     settings = evaluation["settings"]["joint" if method == "joint" else "world_model"]
-    assert settings["augmentation"] == {"recolor": False, "mirror": False, "max_shift": 0, "distractors": 0}
+    assert settings["augmentation"] == {"recolor": False, "mirror": False, "max_shift": 0}
     assert evaluation["settings"]["policy"]["emphasis"] == 0, "the preset sets other options of that group"
     metrics = read_metrics(folder if method == "decoupled" else folder / "seed_0")[-1]
     assert metrics["error_velocity_2"] > 0 and "error_velocity_angle" not in metrics

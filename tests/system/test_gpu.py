@@ -4,7 +4,7 @@ import pytest
 import torch
 from small import POLICY, WORLD_MODEL
 
-from dynmap_rl.data.augmentation import add_distractors, augment
+from dynmap_rl.data.augmentation import augment
 from dynmap_rl.data.demonstrations import load_dataset, load_meta
 from dynmap_rl.data.features import compute_features
 from dynmap_rl.data.windows import sample_windows
@@ -43,7 +43,6 @@ def test_a_training_step_does_not_wait_for_the_gpu(recording, trained):
             batch = features[torch.randint(len(features), (2,), generator=generator, device="cuda")]
         else:
             batch = augment(sample_windows(episodes, 4, 8, generator), generator)
-            batch = add_distractors(batch, generator, 3)
         with mixed_precision("cuda"):
             losses = loss_module(batch)
         step(sum(losses.values()), optimizer)

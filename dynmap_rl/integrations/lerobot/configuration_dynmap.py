@@ -35,8 +35,7 @@ class DynmapConfig(PreTrainedConfig):
         beta_dynamics: weight of the loss of every supervised quantity.
         beta_joint: weight of the policy's loss.
         emphasis: see :func:`dynmap_rl.objectives.imitation_loss`.
-        recolor: permute the colour channels of training windows, and paint bars on the background.
-        distractors: largest number of bars of a window.
+        recolor: permute the colour channels of training windows.
         symmetric: mirror and shift training windows. By default, true where the dataset's task is symmetric.
         mixed: train, and encode frames in control, in bfloat16 where the processor supports it.
         delay: age of a frame, in control steps, when the action that it leads to is executed. In ``select_action``, every
@@ -66,7 +65,6 @@ class DynmapConfig(PreTrainedConfig):
     beta_joint: float = 1.0
     emphasis: float = 60.0
     recolor: bool = True
-    distractors: int = 3
     symmetric: bool | None = None
     mixed: bool = True
     delay: int = 0

@@ -9,7 +9,7 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_STATE
 from tensordict import TensorDict
 
-from dynmap_rl.data.augmentation import add_distractors, augment
+from dynmap_rl.data.augmentation import augment
 from dynmap_rl.keys import DYNAMICS
 from dynmap_rl.modules.actor import Actor
 from dynmap_rl.modules.checkpoints import make_policy, make_world_model
@@ -135,7 +135,7 @@ class DynmapPolicy(PreTrainedPolicy):
         # Seeded by torch's own generator, which LeRobot saves and restores.
         generator = torch.Generator(windows.device).manual_seed(torch.randint(2**62, ()).item())
         limits = {} if self.symmetric else {"max_shift": 0, "mirror": False}
-        return add_distractors(augment(windows, generator, **limits), generator, self.config.distractors)
+        return augment(windows, generator, **limits)
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, torch.Tensor], **kwargs) -> torch.Tensor:
