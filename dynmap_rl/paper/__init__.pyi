@@ -1,9 +1,9 @@
-from .cells import Cell as Cell
-from .cells import list_cells as list_cells
+from .cells import Run as Run
+from .cells import list_runs as list_runs
 from .findings import compare_cells as compare_cells
-from .findings import measure_spread as measure_spread
 from .page import write_results_page as write_results_page
 from .published import paper_numbers as paper_numbers
+from .results import Cell as Cell
 from .results import read_cells as read_cells
 from .tables import markdown_overview as markdown_overview
 from .tables import markdown_tables as markdown_tables

@@ -1,27 +1,28 @@
-"""The paper's claims as comparisons of two cells each, on the start states that both share (paper, Sec. V)."""
+"""The paper's claims as comparisons of two cells each, on the start states that both share (paper, Sec. V).
+
+Trainings of world models differ by more than the same policies on different scenes. A comparison therefore has a verdict
+only where every world model of one cell is better than every world model of the other.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
-import numpy as np
-from scipy.stats import false_discovery_control
-
-from dynmap_rl.evaluation.protocol import result_rows
 from dynmap_rl.evaluation.statistics import rate_gap
 
-from .results import ROWS, Key, read_cells
+from .cells import Key
+from .results import ROWS, Cell
 from .tables import join_table
 
 ONE, TWO, THREE = "balance_reaching", "balance_reaching_obstacle", "bin_dropping"
 DYNAMICS_ROWS = [row for row in ROWS if row.startswith("RGB+")]
-LEVEL = 0.05  # of the adjusted p, below which a difference is clear
+HOLDS, FAILED, OPEN = VERDICTS = "holds", "does not hold", "open"
 
 DROPS = "Recurrent policies drop the block less often than feed-forward ones"
 FAILS = "Transfer fails on task 3"
 NEGATIVE = DROPS, FAILS  # claims that a negative gap supports; any other is supported by a positive one
+FEWEST = 2  # world models of a cell for a verdict
 
 
 @dataclass(frozen=True)
@@ -105,57 +106,54 @@ def _transfer() -> Iterator[Pair]:
             yield Pair(claim, _position(row), f"{row} - Only-RGB", *pair)
 
 
-def compare_cells(results: Path) -> list[dict]:
-    """Compare every pair of which both cells are in a folder of results.
+def compare_cells(cells: Mapping[Key, Cell]) -> list[dict]:
+    """Compare every pair of which both cells have a complete run.
+
+    Args:
+        cells: result of :func:`dynmap_rl.paper.results.read_cells`.
 
     Returns:
         Dicts with ``claim``, ``group`` and ``comparison`` of the pair; ``rates`` of both (%); ``gap`` in points with its
-        95 % bootstrap ``interval`` over the start states; ``p`` of a paired permutation test, adjusted for all
-        comparisons (Benjamini and Hochberg); ``apart``, whether every policy of one cell has a higher rate than every
-        policy of the other; and ``verdict``: ``agrees``, ``contradicts`` or ``unclear``.
+        95 % bootstrap ``interval`` over the shared start states; ``p`` of a paired permutation test; numbers of
+        ``scenes`` and, for both, of ``world_models``; and ``verdict``. That is ``holds`` if every world model of one cell
+        is better than every world model of the other, as the claim says, and the interval does not hold 0; ``does not
+        hold`` if this is so the other way round; else, or if one of the cells has a single world model, ``open``.
     """
-    cells = read_cells(results)
-    rows = [_compare(pair, cells) for pair in list_pairs() if pair.a in cells and pair.b in cells]
-    adjusted = false_discovery_control([row["p"] for row in rows]) if rows else []
-    for row, p in zip(rows, adjusted, strict=True):
-        row["p"] = float(p)
-        supports = (row["gap"] < 0) == (row["claim"] in NEGATIVE)
-        row["verdict"] = "unclear" if p >= LEVEL else "agrees" if supports else "contradicts"
-    return rows
+    pairs = [pair for pair in list_pairs() if cells[pair.a].results and cells[pair.b].results]
+    return [_compare(pair, cells[pair.a], cells[pair.b]) for pair in pairs]
 
 
-def _compare(pair: Pair, cells: dict[Key, dict]) -> dict:
+def _compare(pair: Pair, a: Cell, b: Cell) -> dict:
     metric, outcome = pair.metric
-    both = [result_rows(cells[key]) for key in (pair.a, pair.b)]
-    each_a, each_b = ([np.mean([row[outcome] for row in seed]) for seed in rows_of] for rows_of in both)
+    each_a, each_b = a.rates(outcome), b.rates(outcome)
+    found = rate_gap(a.policies, b.policies, outcome)
+    low, high = found["interval"]
+    above, below = min(each_a) > max(each_b) and low > 0, max(each_a) < min(each_b) and high < 0
+    if pair.claim in NEGATIVE:
+        above, below = below, above
+    enough = min(len(each_a), len(each_b)) >= FEWEST
     return {
         "claim": pair.claim,
         "group": pair.group,
         "comparison": pair.comparison,
-        "rates": [cells[key]["test_protocol"][metric] for key in (pair.a, pair.b)],
-        **rate_gap(*both, outcome),
-        "apart": bool(min(each_a) > max(each_b) or max(each_a) < min(each_b)),
+        "rates": [a.summary[metric], b.summary[metric]],
+        "gap": found["gap"],
+        "interval": found["interval"],
+        "p": found["p"],
+        "scenes": len(a.policies[0]),
+        "world_models": [len(each_a), len(each_b)],
+        "verdict": HOLDS if enough and above else FAILED if enough and below else OPEN,
     }
 
 
-def measure_spread(results: Path) -> list[dict]:
-    """Measure how much decoupled cells of task 1 differ between world models of several seeds.
-
-    Returns:
-        For every row with more than one seed a dict with ``row``, ``SR`` of each seed (%), their ``mean`` and standard
-        deviation ``std``.
-    """
-    seeds, rows = [read_cells(results, seed) for seed in range(3)], []
-    for row in ROWS:
-        found = [cells.get((ONE, "decoupled", "recurrent", row)) for cells in seeds]
-        rates = [result["test_protocol"]["SR"] for result in found if result]
-        if len(rates) > 1:
-            rows.append({"row": row, "SR": rates, "mean": float(np.mean(rates)), "std": float(np.std(rates))})
-    return rows
+def judge_claim(comparisons: list[dict]) -> str:
+    """Return the verdict on a claim: ``holds`` or ``does not hold`` if all of its comparisons say so, else ``open``."""
+    verdicts = {row["verdict"] for row in comparisons}
+    return verdicts.pop() if len(verdicts) == 1 else OPEN
 
 
 def markdown_claims(comparisons: list[dict]) -> str:
-    """Return a table that counts the verdicts on every claim.
+    """Return a table of the verdicts on every claim.
 
     Args:
         comparisons: result of :func:`compare_cells`.
@@ -163,13 +161,11 @@ def markdown_claims(comparisons: list[dict]) -> str:
     lines = []
     for claim, group in dict.fromkeys((row["claim"], row["group"]) for row in comparisons):
         own = [row for row in comparisons if (row["claim"], row["group"]) == (claim, group)]
-        counts = [
-            str(sum(row["verdict"] == name for row in own)) for name in ("agrees", "contradicts", "unclear")
-        ]
+        counts = [str(sum(row["verdict"] == verdict for row in own)) for verdict in VERDICTS]
         gaps = sorted(row["gap"] for row in own)
         span = f"{gaps[0]:+.1f}" if len(gaps) == 1 else f"{gaps[0]:+.1f} to {gaps[-1]:+.1f}"
-        lines.append([claim, group, *counts, span])
-    return join_table(["claim", "comparisons", "agree", "contradict", "unclear", "gaps, points"], lines)
+        lines.append([claim, group, f"**{judge_claim(own)}**", *counts, span])
+    return join_table(["claim", "comparisons", "verdict", *VERDICTS, "gaps, points"], lines)
 
 
 def markdown_comparisons(comparisons: list[dict]) -> str:
@@ -181,7 +177,14 @@ def markdown_comparisons(comparisons: list[dict]) -> str:
     parts = []
     for claim in dict.fromkeys(row["claim"] for row in comparisons):
         own = [row for row in comparisons if row["claim"] == claim]
-        head = ["", "DR" if claim == DROPS else "SR", "gap, points", "p", "policies apart", "claim"]
+        head = [
+            "",
+            "DR" if claim == DROPS else "SR",
+            "gap, points [scenes]",
+            "scenes",
+            "world models",
+            "claim",
+        ]
         parts.append(f"**{claim}**\n\n{join_table(head, [_comparison_row(row) for row in own])}")
     return "\n\n".join(parts)
 
@@ -193,15 +196,7 @@ def _comparison_row(row: dict) -> list[str]:
         " - ".join(f"{rate:.1f}" for rate in row["rates"]),
         f"{row['gap']:+.1f} [{low:.1f}, {high:.1f}]",
         f"{row['p']:.3f}" if row["p"] >= 0.001 else "< 0.001",
-        "yes" if row["apart"] else "no",
+        f"{row['scenes']:,}",
+        " - ".join(map(str, row["world_models"])),
         row["verdict"],
     ]
-
-
-def markdown_spread(results: Path) -> str:
-    """Return a table of :func:`measure_spread`."""
-    lines = [
-        [row["row"], ", ".join(f"{rate:.1f}" for rate in row["SR"]), f"{row['mean']:.1f} ({row['std']:.1f})"]
-        for row in measure_spread(results)
-    ]
-    return join_table(["world models of several seeds", "SR of each", "mean (std)"], lines)

@@ -1,32 +1,50 @@
-"""Runs of cells: each in a process of its own, on this machine or on a Ray cluster."""
+"""Start of runs: each in a process of its own, on this machine or on a Ray cluster."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import Future, ThreadPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
+from queue import SimpleQueue
 
 from dynmap_rl.utils.files import read_json, write_json
 from dynmap_rl.utils.processes import run_script
 
-from .cells import Cell
+from .cells import Run
 
 LAUNCHERS = "local", "ray"
 
 
 def is_done(name: str, results: Path) -> bool:
-    """Return whether a cell has a result."""
+    """Return whether a run has a result."""
     return (results / f"{name}.json").exists()
 
 
 def has_run(name: str, runs: Path) -> bool:
-    """Return whether the run of a cell is complete."""
+    """Return whether a run is complete."""
     return (runs / name / "eval.json").exists()
 
 
-def run_cell(
-    cell: Cell,
+def find_missing(runs: Path, names: Sequence[str]) -> list[str]:
+    """Return and print which runs of a folder are not complete.
+
+    Raises:
+        ValueError: none of them is complete.
+    """
+    missing = [name for name in names if not has_run(name, runs)]
+    if not missing:
+        return []
+    how = f"{runs / missing[0]} must be a finished run; run python recipes/paper/tables.py --results runs/results"
+    how += f" --only {missing[0]}" + (f" ({len(missing) - 1} more: without --only)" if missing[1:] else "")
+    if len(missing) == len(names):
+        raise ValueError(how)
+    print(f"{len(names) - len(missing)} of {len(names)} runs are there: {how}")
+    return missing
+
+
+def execute(
+    run: Run,
     recipes: Path,
     results: Path,
     runs: Path,
@@ -35,10 +53,10 @@ def run_cell(
     presets: Path | None = None,
     root: Path = Path(),
 ) -> str | None:
-    """Run the recipe of a cell and keep its ``eval.json`` as the cell's result.
+    """Execute a run's recipe and keep its ``eval.json`` as the result.
 
     Args:
-        cell: cell to run.
+        run: run to execute.
         recipes: folder of the recipes.
         results: folder of the results.
         runs: folder of the runs; the recipe's output is appended to ``NAME.log`` beside the run.
@@ -49,56 +67,59 @@ def run_cell(
     Returns:
         None, or a message if the run failed.
     """
-    folder, log = runs / cell.name, root / runs / f"{cell.name}.log"
-    arguments = [*cell.arguments, "--run", str(folder), "--compute.threads", str(threads)]
-    if cell.needs:
-        arguments += ["--pretrained", str(runs / cell.needs)]
-    if presets and (preset := root / presets / f"{cell.recipe}.yaml").exists():
+    folder, log = runs / run.name, root / runs / f"{run.name}.log"
+    arguments = [*run.arguments, "--run", str(folder), "--compute.threads", str(threads)]
+    if run.needs:
+        arguments += ["--pretrained", str(runs / run.needs)]
+    if presets and (preset := root / presets / f"{run.recipe}.yaml").exists():
         arguments += ["--config_path", str(preset)]
     log.parent.mkdir(parents=True, exist_ok=True)
-    if run_script(recipes / f"{cell.recipe}.py", arguments, root, log):
+    if run_script(recipes / f"{run.recipe}.py", arguments, root, log):
         last = (log.read_text(errors="replace").splitlines() or ["no output"])[-1]
-        return f"{cell.name} failed; see {runs / cell.name}.log, which ends with: {last}"
-    if not is_done(cell.name, root / results):
-        write_json(root / results / f"{cell.name}.json", read_json(root / folder / "eval.json"))
+        return f"{run.name} failed; see {folder}.log, which ends with: {last}"
+    if not is_done(run.name, root / results):
+        write_json(root / results / f"{run.name}.json", read_json(root / folder / "eval.json"))
     return None
 
 
 def launch(
-    cells: Sequence[Cell],
-    run: Callable[[Cell], str | None],
+    runs: Sequence[Run],
+    start: Callable[[Run], str | None],
     launcher: str = "local",
     *,
     workers: int = 1,
     cpus: float = 2,
     gpus: float = 0,
 ) -> list[str]:
-    """Run cells that do not depend on each other, and print the name of each that is done.
+    """Execute runs in order, and print the name of each that is done.
+
+    A run whose world model comes from another one of them waits for that run, and does not start if that one fails.
 
     Args:
-        cells: cells to run.
-        run: function that runs a cell and returns a message if it failed, such as :func:`run_cell` with its folders.
+        runs: runs to execute; a world model's run comes before those that need it.
+        start: function that executes a run and returns a message if it failed, such as :func:`execute` with its
+            folders.
         launcher: ``local`` or ``ray``.
-        workers: cells at a time, with ``local``.
-        cpus: CPUs of a cell, with ``ray``.
-        gpus: GPUs of a cell, with ``ray``.
+        workers: runs at a time, with ``local``.
+        cpus: CPUs of a run, with ``ray``.
+        gpus: GPUs of a run, with ``ray``.
 
     Returns:
-        Messages of the cells that failed.
+        Messages of the runs that failed.
 
     Raises:
         ValueError: the launcher is unknown, or is ``ray`` and Ray is not installed.
     """
     check_launcher(launcher)
-    if not cells:
+    if not runs:
         return []
     failed = []
-    ends = launch_ray(cells, run, cpus, gpus) if launcher == "ray" else launch_local(cells, run, workers)
-    for cell, message in ends:
+    ends = launch_ray(runs, start, cpus, gpus) if launcher == "ray" else launch_local(runs, start, workers)
+    for run, message in ends:
         if message:
             failed.append(message)
         else:
-            print(f"done: {cell.name}", flush=True)
+            print(f"done: {run.name}", flush=True)
     return failed
 
 
@@ -111,37 +132,49 @@ def check_launcher(launcher: str) -> None:
 
 
 def launch_local(
-    cells: Sequence[Cell], run: Callable[[Cell], str | None], workers: int = 1
-) -> Iterator[tuple[Cell, str | None]]:
-    """Run cells in threads, and yield them with their messages in the order in which they end."""
+    runs: Sequence[Run], start: Callable[[Run], str | None], workers: int = 1
+) -> Iterator[tuple[Run, str | None]]:
+    """Execute runs in threads, and yield them with their messages in the order in which they end."""
     with ThreadPoolExecutor(workers) as pool:  # threads that wait for processes
+        futures, ended = {}, SimpleQueue()
+        for run in runs:  # started in order: a run that is waited for has begun
+            futures[run.name] = pool.submit(_after, futures.get(run.source), start, run)
+            futures[run.name].add_done_callback(ended.put)
+        running = dict(zip(futures.values(), runs, strict=True))
         try:
-            running = {pool.submit(run, cell): cell for cell in cells}
-            for future in as_completed(running):
+            for _ in runs:
+                future = ended.get()
                 yield running[future], future.result()
-        except BaseException:  # Ctrl-C reaches the running cells too; no other may begin
+        except BaseException:  # Ctrl-C reaches the current runs too; no other may begin
             pool.shutdown(cancel_futures=True)
             raise
 
 
 def launch_ray(
-    cells: Sequence[Cell], run: Callable[[Cell], str | None], cpus: float = 2, gpus: float = 0
-) -> Iterator[tuple[Cell, str | None]]:
-    """Run cells on a Ray cluster, and yield them with their messages in the order in which they end."""
+    runs: Sequence[Run], start: Callable[[Run], str | None], cpus: float = 2, gpus: float = 0
+) -> Iterator[tuple[Run, str | None]]:
+    """Execute runs on a Ray cluster, and yield them with their messages in the order in which they end."""
     import ray
 
     if not ray.is_initialized():
         ray.init(log_to_driver=False)
-    remote = ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=0)(_call)
-    running = {remote.remote(run, cell): cell for cell in cells}
+    remote, refs = ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=0)(_start), {}
+    for run in runs:  # Ray waits for the result that is an argument
+        refs[run.name] = remote.remote(refs.get(run.source), start, run)
+    running = dict(zip(refs.values(), runs, strict=True))
     while running:
         (done,), _ = ray.wait(list(running))
-        cell = running.pop(done)
+        run = running.pop(done)
         try:
-            yield cell, ray.get(done)
+            yield run, ray.get(done)
         except ray.exceptions.RayError as error:
-            yield cell, f"{cell.name} was lost by Ray ({type(error).__name__}); the same command resumes"
+            yield run, f"{run.name} was lost by Ray ({type(error).__name__}); the same command resumes"
 
 
-def _call(run: Callable[[Cell], str | None], cell: Cell) -> str | None:
-    return run(cell)
+def _after(needed: Future | None, start: Callable[[Run], str | None], run: Run) -> str | None:
+    return _start(needed and needed.result(), start, run)
+
+
+def _start(failed: str | None, start: Callable[[Run], str | None], run: Run) -> str | None:
+    """Execute a run, unless the run that it needs has failed."""
+    return f"{run.name} needs the world model of a failed run" if failed else start(run)

@@ -1,14 +1,22 @@
-"""Results of the cells of the paper's tables, read from a folder."""
+"""Results of the cells of the tables, read from a folder."""
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
+import numpy as np
+
+from dynmap_rl.evaluation.protocol import result_rows, unpack_rows
+from dynmap_rl.evaluation.statistics import shared_interval, student_interval, summarize, summarize_seeds
 from dynmap_rl.utils.files import read_json
 
-from .published import TABLES, paper_numbers
+from .cells import Key, Run, list_runs
+from .published import METRICS, TABLES
 
-Key = tuple[str, str, str, str]  # task, training, policy, row
 ROWS = list(TABLES["bin_dropping", "joint", "recurrent"])  # in the paper's order, End-to-End first
 COLUMNS = {  # table: its columns, as (task, training, policy)
     "I": [key for key in TABLES if key[0] == "balance_reaching"],
@@ -17,28 +25,104 @@ COLUMNS = {  # table: its columns, as (task, training, policy)
 }
 
 
-def read_cells(results: Path, world_model_seed: int = 0) -> dict[Key, dict]:
-    """Read the results of all cells that the paper has too.
+@dataclass(frozen=True)
+class Cell:
+    """Results of all runs of a cell that are complete.
+
+    Attributes:
+        key: task, training, policy and row.
+        table: table of the cell.
+        results: ``eval.json`` of each complete run.
+        missing: number of runs without a result.
+    """
+
+    key: Key
+    table: str
+    results: tuple[dict, ...]
+    missing: int = 0
+
+    @property
+    def row(self) -> str:
+        """Name of the row."""
+        return self.key[-1]
+
+    @cached_property
+    def world_models(self) -> list[list[list[dict]]]:
+        """Episode rows on the shared start states, by world model and policy.
+
+        Each seed of joint and end-to-end training on task 1 has a world model of its own.
+        """
+        found = []
+        for result in self.results:
+            policies = result_rows(result)
+            # A run on a frozen world model names its fingerprint.
+            found += [policies] if result.get("world_model_sha256") else [[rows] for rows in policies]
+        return found
+
+    @property
+    def policies(self) -> list[list[dict]]:
+        """Episode rows on the shared start states, by policy."""
+        return [rows for policies in self.world_models for rows in policies]
+
+    def rates(self, outcome: str = "success") -> list[float]:
+        """Return the rate of an outcome for each world model, over its policies (%)."""
+        return [
+            100 * float(np.mean([[row[outcome] for row in rows] for rows in policies]))
+            for policies in self.world_models
+        ]
+
+    @cached_property
+    def summary(self) -> dict:
+        """Summary over all policies on the shared start states.
+
+        ``DR`` (%), ``PE`` (mm), ``SR`` (%), ``episodes``; 95 % ``SR_interval`` over scenes; ``world_models``, the SR of
+        each; ``world_model_interval``, the 95 % interval of their mean, or None for fewer than two.
+        """
+        rates = self.rates()
+        return summarize([row for rows in self.policies for row in rows]) | {
+            "SR_interval": shared_interval(self.policies),
+            "world_models": rates,
+            "world_model_interval": student_interval(rates),
+        }
+
+    @cached_property
+    def protocol(self) -> dict[str, tuple[float, float]] | None:
+        """Mean and standard deviation over the policies by the paper's protocol; None where it was not run."""
+        seeds = [seed for result in self.results for seed in result["results"]]
+        if not all("paper" in seed for seed in seeds):
+            return None
+        return summarize_seeds([unpack_rows(seed["paper"]["rows"]) for seed in seeds])
+
+    @property
+    def published(self) -> dict[str, tuple[float, float]] | None:
+        """The paper's mean and standard deviation of each metric; None where the paper has no such cell."""
+        *column, row = self.key
+        numbers = TABLES.get(tuple(column), {}).get(row)
+        return numbers and dict(zip(METRICS[self.key[0]], numbers, strict=True))
+
+
+def read_cells(results: Path, tables: Iterable[str] = tuple(COLUMNS)) -> dict[Key, Cell]:
+    """Read the results of all cells of some tables; a cell without a complete run is there too.
 
     Args:
-        results: folder with an ``eval.json`` of a run for each cell, under any name.
-        world_model_seed: seed of the decoupled world models.
+        results: folder with the ``eval.json`` of every complete run, as ``NAME.json``.
+        tables: names of the tables; by default the paper's.
 
     Returns:
-        The results by task, training (``decoupled``, or ``joint``, which includes end-to-end), policy and row.
+        The cells by task, training (``decoupled``, or ``joint``, which includes end-to-end), policy and row.
     """
-    cells = {}
-    for path in sorted(results.glob("*.json")):
-        result = read_json(path)
-        if "world_model" not in result or _world_model_seed(result["settings"]) != world_model_seed:
-            continue
-        if paper_numbers(result):
-            training = "decoupled" if result["world_model"]["training"] == "decoupled" else "joint"
-            cells[result["task"], training, result["policy"], result["row"]] = result
-    return cells
+    runs: dict[Key, list[Run]] = {}
+    for run in list_runs():
+        if run.table in tables:
+            runs.setdefault(run.cell, []).append(run)
+    return {key: _read_cell(results, key, of_cell) for key, of_cell in runs.items()}
 
 
-def _world_model_seed(settings: dict) -> int:
-    nested = settings.get("world_model")
-    # Settings of the first release were flat, and its world_model was the path of a run.
-    return nested.get("seed", 0) if isinstance(nested, dict) else settings.get("world_model_seed", 0)
+def _read_cell(results: Path, key: Key, runs: list[Run]) -> Cell:
+    paths = [path for run in runs if (path := results / f"{run.name}.json").exists()]
+    return Cell(key, runs[0].table, tuple(map(read_json, paths)), len(runs) - len(paths))
+
+
+def count_commits(cells: Iterable[Cell]) -> Counter[str]:
+    """Return how many runs of some cells each commit has made."""
+    return Counter(str(result.get("commit")) for cell in cells for result in cell.results)

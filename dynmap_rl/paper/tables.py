@@ -1,94 +1,119 @@
-"""The paper's three tables with our results beside the paper's."""
+"""The paper's three tables with our results beside the paper's, and tables of our own."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Iterable, Mapping
 
-from dynmap_rl.evaluation.protocol import result_rows
-from dynmap_rl.evaluation.statistics import shared_interval, summarize
+from dynmap_rl.evaluation.statistics import rate_gap, summarize
 
-from .published import METRICS, TABLES, paper_numbers
-from .results import COLUMNS, ROWS, read_cells
+from .cells import Key
+from .published import METRICS, TABLES
+from .results import COLUMNS, ROWS, Cell, count_commits
+
+OWN = {  # tables that the paper does not have: what they show
+    "extra": "World models of the paper's plain CNNs beside the default, on the shared test scenes",
+    "ablations": "RGB+[P+V] with recurrent policies, on validation scenes: the default, and rows that differ from it",
+}
 
 
-def table_rows(results: Path) -> list[dict]:
-    """Return a dict for every cell of a folder of results.
+def table_rows(cells: Mapping[Key, Cell]) -> list[dict]:
+    """Return a dict for every cell that has a complete run.
 
     Returns:
-        Dicts with ``table``, ``row``, ``column``; on the shared start states ``DR`` (%), ``PE`` (mm), ``SR`` (%), the
-        number ``n`` of episodes, the 95 % ``interval`` of SR and the SR of each of the ``policies``; mean and standard
-        deviation by the paper's ``protocol`` (None where it was not run) and in the ``paper``; ``seeds``; ``command``.
+        Dicts with ``table``, ``row``, ``column``, ``n`` (number of episodes), ``missing`` (runs without a result) and the
+        entries of :attr:`dynmap_rl.paper.results.Cell.summary`; SR of each of the ``policies``; mean and standard
+        deviation by the paper's ``protocol`` (None where it was not run) and in the ``paper``; ``commands``; the number
+        of runs of each of the ``commits``.
     """
-    cells = read_cells(results)
     return [
-        {"table": table, "row": row, "column": _name(column), **_describe(cells[*column, row])}
-        for table, columns in COLUMNS.items()
-        for row in ROWS
-        for column in columns
-        if (*column, row) in cells
+        {
+            "table": cell.table,
+            "row": cell.row,
+            "column": _name(cell.key[:-1]),
+            "n": cell.summary["episodes"],
+            "missing": cell.missing,
+            **cell.summary,
+            "policies": [summarize(rows)["SR"] for rows in cell.policies],
+            "protocol": cell.protocol,
+            "paper": cell.published,
+            "commands": [result["command"] for result in cell.results],
+            "commits": count_commits([cell]),
+        }
+        for cell in cells.values()
+        if cell.results
     ]
 
 
-def _describe(result: dict) -> dict:
-    test, rows = result["test_protocol"], result_rows(result)
-    return {
-        **{name: test[name] for name in ("DR", "PE", "SR")},
-        "n": test["episodes"],
-        "interval": shared_interval(rows),
-        "policies": [summarize(of_seed)["SR"] for of_seed in rows],
-        "protocol": result.get("paper_protocol"),
-        "paper": paper_numbers(result),
-        "seeds": result["seeds"],
-        "command": result["command"],
-    }
-
-
-def markdown_overview(results: Path) -> str:
-    """Return SR (%) of all three tables as one table: the paper's / ours on the 1,000 shared start states."""
-    cells = read_cells(results)
+def markdown_overview(cells: Mapping[Key, Cell]) -> str:
+    """Return SR (%) of the paper's tables as one table: the paper's / ours on the 1,000 shared start states."""
     columns = [column for columns in COLUMNS.values() for column in columns]
     lines = []
     for row in ROWS:
         line = [row]
         for column in columns:
-            paper, result = TABLES[column].get(row), cells.get((*column, row))
-            ours = f"**{result['test_protocol']['SR']:.1f}**" if result else "-"
+            paper, cell = TABLES[column].get(row), cells.get((*column, row))
+            ours = f"**{cell.summary['SR']:.1f}**" if cell and cell.results else "-"
             line.append(f"{paper[-1][0]} / {ours}" if paper else "")
         lines.append(line)
     names = [f"{table}: {_name(column)}" for table, columns in COLUMNS.items() for column in columns]
-    return join_table(["", *names], lines)
+    paper = [cells[*column, row] for column in columns for row in ROWS if (*column, row) in cells]
+    return f"{join_table(['', *names], lines)}\n\n{_notes(paper)}"
 
 
-def markdown_column(results: Path, column: tuple[str, str, str]) -> str:
-    """Return one column of a table with all metrics.
+def markdown_column(cells: Mapping[Key, Cell], column: tuple[str, str, str]) -> str:
+    """Return one column of a table of the paper with all metrics.
 
     Args:
-        results: folder of results.
+        cells: result of :func:`dynmap_rl.paper.results.read_cells`.
         column: task, training and policy.
 
     Returns:
-        The paper's numbers, ours by its protocol, and ours on the 1,000 shared start states.
+        The paper's numbers, ours by its protocol, and ours on the 1,000 shared start states, with what is missing and
+        the commits below.
     """
-    cells, others = read_cells(results), [name for name in METRICS[column[0]] if name != "SR"]
+    own, others = [cells[*column, row] for row in ROWS if (*column, row) in cells], _others(column[0])
     what = "SR (std)" + (f"; {', '.join(others)}" if others else "")
-    head = [
-        "",
-        f"paper: {what}",
-        f"here, paper's protocol: {what}",
-        *others,
-        "SR, shared starts",
-        "SR of each policy",
+    head = ["", f"paper: {what}", f"here, paper's protocol: {what}", *_head(others)]
+    lines = [
+        [
+            cell.row,
+            _short(cell.published, others),
+            _short(cell.protocol, others) if cell.results and cell.protocol else "-",
+            *_numbers(cell, others),
+        ]
+        for cell in own
     ]
-    found = [cells[*column, row] for row in ROWS if (*column, row) in cells]
-    return join_table(head, [_column_row(result, others) for result in found])
+    return f"{join_table(head, lines)}\n\n{_notes(own)}"
 
 
-def markdown_tables(results: Path) -> str:
-    """Return the overview, and every column of the three tables under its name."""
-    parts = [f"SR in %, the paper's / ours on the 1,000 shared start states\n\n{markdown_overview(results)}"]
+def markdown_own(cells: Mapping[Key, Cell], table: str) -> str:
+    """Return a table that the paper does not have.
+
+    Args:
+        cells: result of :func:`dynmap_rl.paper.results.read_cells` for this table and Table I.
+        table: ``extra``, whose rows stand below those of Table I with the default world model, or ``ablations``, whose
+            first row is the default.
+    """
+    own, numbers, lines = [cell for cell in cells.values() if cell.table == table], ["DR", "PE"], []
+    for cell in own:
+        if table == "ablations":
+            default, pair = own[0], [cell]
+        else:
+            default = cells.get((*cell.key[:-1], cell.row.removesuffix(", plain CNN")))
+            pair = [default, cell] if default else [cell]
+        lines += [[c.row, c.key[2], *_numbers(c, numbers), _difference(c, default)] for c in pair]
+    head = ["", "policy", *_head(numbers), "SR less the default's [scenes]"]
+    return f"{join_table(head, lines)}\n\n{_notes(own)}"
+
+
+def markdown_tables(cells: Mapping[Key, Cell]) -> str:
+    """Return the overview, every column of the paper's tables under its name, and the tables of our own."""
+    parts = [f"SR in %, the paper's / ours on the 1,000 shared start states\n\n{markdown_overview(cells)}"]
     for table, columns in COLUMNS.items():
         for column in columns:
-            parts.append(f"Table {table}, {_name(column)}\n\n{markdown_column(results, column)}")
+            parts.append(f"Table {table}, {_name(column)}\n\n{markdown_column(cells, column)}")
+    for table, what in OWN.items():
+        parts.append(f"{what}\n\n{markdown_own(cells, table)}")
     return "\n\n".join(parts)
 
 
@@ -97,27 +122,66 @@ def join_table(head: list[str], rows: list[list[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in (head, ["---"] * len(head), *rows))
 
 
-def _name(column: tuple[str, str, str]) -> str:
+def _name(column: tuple[str, ...]) -> str:
     return ", ".join(column[1:])
 
 
-def _column_row(result: dict, others: list[str]) -> list[str]:
-    cell = _describe(result)
-    low, high = cell["interval"]
-    rate = f"**{cell['SR']:.1f}** [{low:.1f}, {high:.1f}]"
-    each = ", ".join(f"{rate:.1f}" for rate in cell["policies"])
-    ours = _short(cell["protocol"], others) if cell["protocol"] else "-"
+def _others(task: str) -> list[str]:
+    return [name for name in METRICS[task] if name != "SR"]
+
+
+def _head(others: list[str]) -> list[str]:
+    return [*others, "SR [scenes]", "SR of each world model", "their mean [world models]", "policies"]
+
+
+def _numbers(cell: Cell, others: list[str]) -> list[str]:
+    """Return the entries of a cell under :func:`_head`."""
+    if not cell.results:
+        return ["-"] * len(_head(others))
+    summary = cell.summary
+    rates, interval = summary["world_models"], summary["world_model_interval"]
+    mean = f"{sum(rates) / len(rates):.1f} {_brackets(interval)}" if interval else "-"
     return [
-        result["row"],
-        _short(cell["paper"], others),
-        ours,
-        *(f"{cell[k]:.1f}" for k in others),
-        rate,
-        each,
+        *(f"{summary[name]:.1f}" for name in others),
+        f"**{summary['SR']:.1f}** {_brackets(summary['SR_interval'])}",
+        ", ".join(f"{rate:.1f}" for rate in rates),
+        mean,
+        str(len(cell.policies)),
     ]
+
+
+def _brackets(interval: tuple[float, float]) -> str:
+    low, high = interval
+    return f"[{low:.1f}, {high:.1f}]"
+
+
+def _difference(cell: Cell, default: Cell | None) -> str:
+    """Return the difference of two success rates in points, with its interval over the scenes."""
+    if cell is default:
+        return ""
+    if default is None or not (cell.results and default.results):
+        return "-"
+    found = rate_gap(cell.policies, default.policies)
+    return f"{found['gap']:+.1f} {_brackets(found['interval'])}"
 
 
 def _short(numbers: dict, others: list[str]) -> str:
     mean, std = numbers["SR"]
     rest = ", ".join(f"{numbers[name][0]:.0f}" for name in others)
     return f"{mean:.0f} ({std:.1f})" + (f"; {rest}" if rest else "")
+
+
+def _notes(cells: Iterable[Cell]) -> str:
+    """Return what is missing of some cells, and how many runs are of which commit where there are several."""
+    cells = list(cells)
+    missing, runs = sum(cell.missing for cell in cells), sum(len(cell.results) for cell in cells)
+    empty = sum(not cell.results for cell in cells)
+    part = sum(bool(cell.missing and cell.results) for cell in cells)
+    text = f"{len(cells)} cells of {runs} runs."
+    if missing:
+        text = f"Of {len(cells)} cells, {empty} are missing and {part} are incomplete: {missing} of {missing + runs} runs."
+    commits = count_commits(cells)
+    if len(commits) > 1:
+        made = ", ".join(f"{count} of `{commit}`" for commit, count in commits.most_common())
+        text += f" Runs of different code: {made}."
+    return text

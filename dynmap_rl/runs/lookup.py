@@ -60,7 +60,8 @@ def load_source(run: str | Path) -> tuple[WorldModel, dict[str, str]]:
     """Load the world model of a finished run, with its origin.
 
     Args:
-        run: see :func:`find_run`; the folder ``world_model`` of a run is accepted too.
+        run: see :func:`find_run`; the folder ``world_model`` of a run is accepted too, and so is the folder ``seed_N`` of
+            a run of joint or end-to-end training.
 
     Returns:
         The world model, and a dict with ``training`` (decoupled, joint or end_to_end) and ``task``, or ``dataset`` for
@@ -71,7 +72,8 @@ def load_source(run: str | Path) -> tuple[WorldModel, dict[str, str]]:
     """
     run = find_run(str(run))
     run = run.parent if run.name == "world_model" else run
-    source = read_json(run / "eval.json").get("world_model") if (run / "eval.json").exists() else None
+    top = run.parent if (run / "world_model").exists() and run.name.startswith("seed_") else run
+    source = read_json(top / "eval.json").get("world_model") if (top / "eval.json").exists() else None
     # The file may be from elsewhere, and folders are named after the training.
     known = isinstance(source, dict) and source.get("training") in TRAININGS
     if not known or not isinstance(source.get("task", source.get("dataset")), str):

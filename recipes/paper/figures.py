@@ -5,7 +5,8 @@
 
 Fig. 2 to 4 show demonstrations, Fig. 6 and 9 predictions of a world model of task 1 on tasks 1 and 3, Fig. 7 policy
 losses, Fig. 8 closed-loop episodes; Fig. 1 and 5 of the paper are diagrams. The figure distributions shows angles and
-angular velocities in the demonstrations, with their ranges as JSON. The page report.html shows all figures.
+angular velocities in the demonstrations, failures the failed episodes of some runs by cause; both come with JSON. The page
+report.html shows all figures.
 """
 
 import sys
@@ -13,6 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from dynmap_rl.paper.launch import find_missing
 from dynmap_rl.utils.cli import command_line, run_recipe
 
 TASKS = {
@@ -91,23 +93,6 @@ def load_episodes(config: Config, datasets: dict, task: str, split: str = "eval"
     return load_dataset(find_or_record(task, datasets[task] if config.datasets else None), split)
 
 
-def how_to_run(config: Config, cells: list[str]) -> str:
-    """Return the command for the first of the cells."""
-    command = f"python recipes/paper/tables.py --results runs/results --only {cells[0]}"
-    command += f" ({len(cells) - 1} more: without --only)" if len(cells) > 1 else ""
-    return f"{config.runs / cells[0]} must be a finished run; run {command}"
-
-
-def find_missing(config: Config, cells: list[str]) -> list[str]:
-    """Return and print the cells without a finished run; ``ValueError`` if none of the cells has one."""
-    missing = [cell for cell in cells if not (config.runs / cell / "eval.json").exists()]
-    if missing == cells:
-        raise ValueError(how_to_run(config, missing))
-    if missing:
-        print(f"{len(cells) - len(missing)} of {len(cells)} runs are there: {how_to_run(config, missing)}")
-    return missing
-
-
 def draw_distributions(config: Config, datasets: dict) -> None:
     """Draw the distributions of angles and angular velocities."""
     from dynmap_rl.reporting.figures import plot_distributions
@@ -150,7 +135,7 @@ def draw_prediction(config: Config, datasets: dict, task: str, name: str) -> Non
     from dynmap_rl.paper.figures import widest_ways
     from dynmap_rl.reporting.figures import plot_prediction
 
-    find_missing(config, [WORLD_MODEL])
+    find_missing(config.runs, [WORLD_MODEL])
     world_model = load_world_model(config.runs / WORLD_MODEL / "world_model")
     episodes = widest_ways(load_episodes(config, datasets, task), 2)
     title = f"World model of task 1 (RGB+[P+V+A]) on held-out episodes of {TASKS[task]}"
@@ -163,7 +148,7 @@ def draw_fig7(config: Config, datasets: dict) -> None:
 
     panels = loss_panels(ONE)
     cells = dict.fromkeys(cell for groups in panels.values() for group in groups.values() for cell in group)
-    missing = find_missing(config, list(cells))
+    missing = find_missing(config.runs, list(cells))
     plot_losses(panels, config.runs, missing, config.output / "fig7.png")
     plot_losses(panels, config.runs, missing, config.output / "fig7_training.png", held_out=False)
     print(f"written: {config.output}/fig7_training.png")
@@ -176,12 +161,25 @@ def draw_fig8(config: Config, datasets: dict) -> None:
     from dynmap_rl.paper.figures import plot_position_errors
     from dynmap_rl.runs.lookup import load_actor
 
-    missing, panels = find_missing(config, list(POLICIES.values())), dict.fromkeys(POLICIES)
+    missing, panels = find_missing(config.runs, list(POLICIES.values())), dict.fromkeys(POLICIES)
     seeds = scene_seeds("test", 50, start=SHARED_STARTS)
     for title, cell in POLICIES.items():
         if cell not in missing:
             panels[title] = roll_out(load_actor(config.runs / cell), ONE, seeds)
     plot_position_errors(panels, config.output / "fig8.png")
+
+
+def draw_failures(config: Config, datasets: dict) -> None:
+    """Draw the failures of some runs by cause, and write them as JSON."""
+    from dynmap_rl.paper.failures import RUNS, find_failures, plot_failures
+    from dynmap_rl.utils.files import write_json
+    from dynmap_rl.utils.version import find_commit
+
+    missing = find_missing(config.runs, RUNS)
+    failures = [find_failures(config.runs / name) for name in RUNS if name not in missing]
+    plot_failures(failures, config.output / "failures.png")
+    facts = {"command": command_line(sys.argv), "commit": find_commit(), "failures": failures}
+    write_json(config.output / "failures.json", facts)
 
 
 FIGURES = {  # functions and captions
@@ -193,6 +191,7 @@ FIGURES = {  # functions and captions
     "fig8": (draw_fig8, "Fig. 8: position errors in closed loop"),
     "fig9": (partial(draw_prediction, task=THREE, name="fig9"), "Fig. 9: predictions on task 3"),
     "distributions": (draw_distributions, "Angles and angular velocities"),
+    "failures": (draw_failures, "Failed episodes by cause"),
 }
 
 

@@ -1,16 +1,17 @@
-"""Run the grid of the paper's Tables I, II and III cell by cell, and print the tables.
+"""Run the grid of the paper's Tables I, II and III and of two more run by run, and print the tables.
 
-    python recipes/paper/tables.py --dry_run                  # cells, those that are complete, remaining time
+    python recipes/paper/tables.py --dry_run                  # runs, those that are complete, remaining time
     python recipes/paper/tables.py --results runs/results     # a grid of your own
-    python recipes/paper/tables.py --table II,III             # cells of some tables
+    python recipes/paper/tables.py --table II,III             # runs of some tables
     python recipes/paper/tables.py --only balance_reaching_decoupled_position --workers 2
     python recipes/paper/tables.py --launcher ray             # on a Ray cluster (pip install '.[ray]')
     python recipes/paper/tables.py --print markdown           # tables from the results alone; or json, findings
     python recipes/paper/tables.py --write                    # recipes/results/README.md from the results alone
 
-A cell is a run of another recipe, and its result a JSON file in the folder of the results; cells with a result are
-skipped. World models are trained once and reused. The same command resumes a stopped grid. The page report.html in the
-folder of the runs shows the tables so far.
+A cell of a table has a run of another recipe for each of three world models, or one run of joint or end-to-end training
+with three seeds. The result of a run is a JSON file in the folder of the results; runs with a result are skipped. World
+models are trained once and reused. The same command resumes a stopped grid. The page report.html in the folder of the
+runs shows the tables so far.
 """
 
 import json
@@ -19,8 +20,8 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from dynmap_rl.paper.cells import TABLES, Cell, list_cells
-from dynmap_rl.paper.launch import LAUNCHERS, check_launcher, has_run, is_done, launch, run_cell
+from dynmap_rl.paper.cells import TABLES, UNDISTURBED, Run, list_runs
+from dynmap_rl.paper.launch import LAUNCHERS, check_launcher, execute, has_run, is_done, launch
 from dynmap_rl.utils.cli import command_line, refuse, run_recipe
 from dynmap_rl.utils.settings import check_at_least
 
@@ -32,25 +33,25 @@ RESULTS = RECIPES / "results"
 class Config:
     """Settings of the recipe."""
 
-    # Folder of the cells' results; by default those of the repository.
+    # Folder of the results; by default those of the repository.
     results: Path = RESULTS / "cells"
-    # Folder of the cells' runs.
+    # Folder of the runs.
     runs: Path = Path("runs/tables")
-    # Tables whose cells are run: any of I,II,III.
+    # Tables whose runs are chosen: any of I,II,III,extra,ablations.
     table: str = ",".join(TABLES)
-    # Cell to run: its name, or a part of several names.
+    # Run to choose: its name, or a part of several names.
     only: str = ""
-    # Cells at a time on this machine; each takes two cores if it is alone, otherwise one.
+    # Runs at a time on this machine; each takes two cores if it is alone, otherwise one.
     workers: int = 1
     # local, or ray: the cluster of RAY_ADDRESS, or one on this machine. All machines must share this folder.
     launcher: str = "local"
-    # CPUs of a cell, with --launcher ray.
+    # CPUs of a run, with --launcher ray.
     cpus: float = 2
-    # GPUs of a cell, with --launcher ray.
+    # GPUs of a run, with --launcher ray.
     gpus: float = 0
-    # Folder with a settings file RECIPE.yaml for any of the recipes, passed to their cells as --config_path.
+    # Folder with a settings file RECIPE.yaml for any of the recipes, passed to their runs as --config_path.
     presets: Path | None = None
-    # List the cells and stop.
+    # List the runs and stop.
     dry_run: bool = False
     # Print the tables as markdown or json, or the findings (the paper's claims as comparisons), and stop.
     print: str | None = None
@@ -70,89 +71,94 @@ class Config:
 
 
 def main(config: Config) -> None:
-    """Run the cells without a result, or print or write the tables."""
+    """Execute the runs without a result, or print or write the tables."""
     if config.print:
         return print_tables(config.results, config.print)
     if config.write:
         return write_tables(config)
     ignored = {"local": ("cpus", "gpus"), "ray": ("workers",)}[config.launcher]
     refuse(config, Config(), ignored, f"--launcher {config.launcher}")
-    cells, todo, sources = choose_cells(config)
+    chosen, todo = choose_runs(config)
     if config.dry_run:
-        return print_cells(cells, todo, sources)
-    from dynmap_rl.training.dataset import find_or_record
-
+        return print_runs(chosen, todo)
     if not todo:
         print(
-            f"nothing to do: {len(cells)} cells are in {config.results}; choose another --results for a new grid"
+            f"nothing to do: {len(chosen)} runs are in {config.results}; choose another --results for a new grid"
         )
         return write_page(config)
     check_launcher(config.launcher)  # recording takes minutes
-    for task in {cell.task for cell in sources + todo}:  # cells must not record at the same time
-        find_or_record(task)
+    record_datasets(todo)
     cores = config.cpus if config.launcher == "ray" else 2 if config.workers == 1 else 1
-    run = partial(
-        run_cell, recipes=RECIPES, results=config.results, runs=config.runs, threads=int(cores),
+    start = partial(
+        execute, recipes=RECIPES, results=config.results, runs=config.runs, threads=int(cores),
         presets=config.presets, root=Path.cwd(),
     )  # fmt: skip
-    start = partial(
-        launch, run=run, launcher=config.launcher, workers=config.workers, cpus=config.cpus, gpus=config.gpus
-    )
-    failed = start([*sources, *(cell for cell in todo if not cell.needs)])
-    ready = [cell for cell in todo if cell.needs and has_run(cell.needs, config.runs)]
-    missing = [cell.name for cell in todo if cell.needs and cell not in ready]
-    failed += start(ready) + [f"{name} needs the world model of a failed cell" for name in missing]
+    failed = launch(todo, start, config.launcher, workers=config.workers, cpus=config.cpus, gpus=config.gpus)
     write_page(config)
     if failed:
         raise ValueError("; ".join(failed))
     return None
 
 
-def choose_cells(config: Config) -> tuple[list[Cell], list[Cell], list[Cell]]:
-    """Return the chosen cells, those without a result, and the cells whose world models must be trained first."""
-    cells = list_cells()
-    candidates = [cell for cell in cells if cell.table in config.table.split(",")]
-    chosen = [cell for cell in candidates if cell.name == config.only]
-    chosen = chosen or [cell for cell in candidates if config.only in cell.name]
+def choose_runs(config: Config) -> tuple[list[Run], list[Run]]:
+    """Return the chosen runs, and those to execute in order: without a result, or with a world model that is missing."""
+    runs = list_runs()
+    candidates = [run for run in runs if run.table in config.table.split(",")]
+    chosen = [run for run in candidates if run.name == config.only]
+    chosen = chosen or [run for run in candidates if config.only in run.name]
     if not chosen:
         raise ValueError(
-            f"--only must be a part of a cell's name, got {config.only!r}; --dry_run lists the names"
+            f"--only must be a part of a run's name, got {config.only!r}; --dry_run lists the names"
         )
-    todo = [cell for cell in chosen if not is_done(cell.name, config.results)]
-    needed = {cell.needs for cell in todo if cell.needs and not has_run(cell.needs, config.runs)}
-    return chosen, todo, [cell for cell in cells if cell.name in needed and cell not in todo]
+    todo = {run.name: run.source for run in chosen if not is_done(run.name, config.results)}
+    needed = {source for source in todo.values() if source and not has_run(source, config.runs)}
+    return chosen, [run for run in runs if run.name in todo or run.name in needed]
 
 
-def print_cells(cells: list[Cell], todo: list[Cell], sources: list[Cell]) -> None:
-    """Print all cells with their minutes, and the remaining time."""
-    for cell in [*sources, *cells]:
-        print(f"{f'{cell.minutes:3} min' if cell in sources + todo else '   done'}  {cell.name}")
-    hours, done = sum(cell.minutes for cell in sources + todo) / 60, len(cells) - len(todo)
-    print(f"{done} of {len(cells)} cells are complete; about {hours:.1f} hours of one core are left")
+def record_datasets(runs: list[Run]) -> None:
+    """Record the datasets that are missing: runs must not record at the same time."""
+    from dynmap_rl.data.recording.record import record_dataset
+    from dynmap_rl.training.dataset import find_or_record
+
+    for task in {run.task for run in runs if not run.dataset}:
+        find_or_record(task)
+    for task in {run.task for run in runs if run.dataset == UNDISTURBED}:
+        record_dataset(UNDISTURBED, task, "undisturbed")
+
+
+def print_runs(chosen: list[Run], todo: list[Run]) -> None:
+    """Print all runs with their minutes, and the remaining time."""
+    done = [run for run in chosen if run not in todo]
+    for run in [run for run in list_runs() if run in chosen or run in todo]:
+        print(f"{f'{run.minutes:3} min' if run in todo else '   done'}  {run.name}")
+    hours = sum(run.minutes for run in todo) / 60
+    print(f"{len(done)} of {len(chosen)} runs are complete; about {hours:.1f} hours of one core are left")
 
 
 def print_tables(results: Path, form: str) -> None:
     """Print the tables as ``markdown`` or ``json``, or the ``findings``."""
     from dynmap_rl.paper import findings, tables
+    from dynmap_rl.paper.results import read_cells
 
+    cells = read_cells(results, TABLES)
     if form == "json":
-        print(json.dumps(tables.table_rows(results), indent=1))
+        print(json.dumps(tables.table_rows(cells), indent=1))
     elif form == "markdown":
-        print(tables.markdown_tables(results))
+        print(tables.markdown_tables(cells))
     else:
-        rows = findings.compare_cells(results)
-        parts = findings.markdown_claims(rows), findings.markdown_comparisons(rows)
-        print("\n\n".join([*parts, findings.markdown_spread(results)]))
+        rows = findings.compare_cells(cells)
+        print("\n\n".join([findings.markdown_claims(rows), findings.markdown_comparisons(rows)]))
 
 
 def write_page(config: Config) -> None:
     """Write ``report.html`` with the tables so far into the folder of the runs."""
+    from dynmap_rl.paper.results import read_cells
     from dynmap_rl.paper.tables import markdown_tables
     from dynmap_rl.reporting.html import write_html
     from dynmap_rl.runs.folder import plain_settings
 
-    text, settings = markdown_tables(config.results), plain_settings(config)
-    print(f"written: {write_html(config.runs, 'Tables I to III', text, command_line(sys.argv), settings)}")
+    text, settings = markdown_tables(read_cells(config.results, TABLES)), plain_settings(config)
+    print(f"written: {write_html(config.runs, 'Tables', text, command_line(sys.argv), settings)}")
 
 
 def write_tables(config: Config) -> None:

@@ -1,39 +1,93 @@
-"""The grid of cells."""
+"""The grid of runs."""
 
-from dynmap_rl.modules.supervision import parse_supervision, row_name
-from dynmap_rl.paper.cells import list_cells
-from dynmap_rl.paper.published import TABLES
+import importlib
+from collections import Counter
 
-CELLS = list_cells()
-BY_NAME = {cell.name: cell for cell in CELLS}
+import pytest
+
+from dynmap_rl.paper.cells import ABLATIONS, SEEDS, TABLES, list_runs
+from dynmap_rl.paper.published import TABLES as PUBLISHED
+from dynmap_rl.utils.cli import parse_settings, read_arguments
+
+RUNS = list_runs()
+BY_NAME = {run.name: run for run in RUNS}
+MAIN = "balance_reaching_decoupled_position_velocity_recurrent"
 
 
-def options_of(cell) -> dict[str, str]:
-    return dict(zip(cell.arguments[::2], cell.arguments[1::2], strict=True))
+def settings_of(run):
+    """Return the settings that a run's recipe parses from its arguments."""
+    config = importlib.import_module(f"recipes.{run.recipe}").Config
+    return parse_settings(config, read_arguments([*run.arguments], config))
 
 
 def test_there_is_a_cell_for_every_one_of_the_paper():
-    found = set()
-    for cell in (cell for cell in CELLS if "world_model_" not in cell.name):
-        source = BY_NAME[cell.needs] if cell.needs else cell
-        supervision = parse_supervision(options_of(source).get("--world_model.supervision", "none"))
-        training = "decoupled" if source.recipe == "decoupled" else "joint"
-        policy = options_of(cell).get("--policy.kind", "recurrent")
-        found.add((cell.task, training, policy, row_name(supervision, source.recipe)))
-    assert found == {(*column, row) for column, rows in TABLES.items() for row in rows}
-    assert len(BY_NAME) == len(CELLS)
+    found = {run.cell for run in RUNS if run.table in ("I", "II", "III")}
+    assert found == {(*column, row) for column, rows in PUBLISHED.items() for row in rows}
+    assert len(BY_NAME) == len(RUNS) and {run.table for run in RUNS} == set(TABLES)
 
 
-def test_needed_world_models_are_trained_first():
-    names = [cell.name for cell in CELLS]
-    for number, cell in enumerate(CELLS):
-        assert cell.needs is None or names.index(cell.needs) < number
-        assert not (cell.needs and BY_NAME[cell.needs].needs)
+def test_every_cell_rests_on_three_world_models():
+    counts = Counter((run.table, run.cell) for run in RUNS)
+    for (table, cell), count in counts.items():
+        own = table == "I" and cell[1] == "joint"  # each of its three seeds has a world model of its own
+        assert count == (1 if own else len(SEEDS)), cell
+    for run in RUNS:
+        if run.recipe in ("joint", "end_to_end"):
+            assert settings_of(run).seeds == "0,1,2"
 
 
-def test_world_models_of_further_seeds_are_of_task_1():
-    seeded = [cell for cell in CELLS if "world_model_" in cell.name]
-    assert len(seeded) == 10
-    for cell in seeded:
-        assert cell.task == "balance_reaching" and cell.table == "I"
-        assert options_of(cell)["--world_model.seed"] == cell.name[-1]
+def test_needed_world_models_are_trained_first_and_are_of_the_same_seed():
+    names = [run.name for run in RUNS]
+    for number, run in enumerate(RUNS):
+        if run.needs:
+            source = BY_NAME[run.source]
+            assert names.index(source.name) < number and source.needs is None
+            seed = run.name.partition("_world_model_")[2]
+            joint = source.recipe in ("joint", "end_to_end")
+            expected = f"{source.name}/seed_{seed}" if joint and seed else source.name
+            assert run.needs == expected and (joint or source.name.partition("_world_model_")[2] == seed)
+
+
+def test_the_seed_of_a_name_is_that_of_the_world_model():
+    for run in RUNS:
+        if run.recipe == "decoupled" and not run.needs:
+            assert settings_of(run).world_model.seed == int(run.name.partition("_world_model_")[2] or 0)
+
+
+def test_the_shipped_model_is_the_first_of_the_grid():
+    assert RUNS[0].name == MAIN
+    assert settings_of(RUNS[0]) == importlib.import_module("recipes.decoupled").Config()
+
+
+@pytest.mark.parametrize("recipe", ["decoupled", "joint", "end_to_end", "generalize"])
+def test_names_tell_runs_of_different_settings_apart(recipe):
+    runs = [run for run in RUNS if run.recipe == recipe]
+    assert len({(settings_of(run), run.needs) for run in runs}) == len(runs)
+
+
+def test_the_first_seeds_of_the_decoupled_cells_come_first():
+    places = [
+        number for number, run in enumerate(RUNS) if run.cell[1] == "decoupled" and run.table != "extra"
+    ]
+    first = [n for n in places if "_world_model_" not in RUNS[n].name and RUNS[n].table != "ablations"]
+    assert first == list(range(len(first)))
+
+
+def test_ablations_differ_from_the_default_in_one_option_on_validation_scenes():
+    runs = {run.cell[-1]: settings_of(run) for run in RUNS if run.table == "ablations"}
+    assert list(runs) == list(ABLATIONS)
+    assert all(run.eval.split == "validation" and not run.eval.paper_episodes for run in runs.values())
+    flat = {row: parts(settings) for row, settings in runs.items()}
+    for row, values in flat.items():
+        seed = "world_model.seed"
+        changed = {name for name, value in values.items() if name != seed and value != flat["default"][name]}
+        assert len(changed) == (row != "default"), (row, changed)
+
+
+def parts(settings, prefix="") -> dict:
+    """Return nested settings as one dict of dotted names."""
+    found = {}
+    for name, value in vars(settings).items():
+        nested = hasattr(value, "__dataclass_fields__")
+        found |= parts(value, f"{prefix}{name}.") if nested else {prefix + name: value}
+    return found

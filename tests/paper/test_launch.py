@@ -1,17 +1,19 @@
-"""Runs of cells: the recipe's arguments, the result, and messages of those that fail."""
+"""Start of runs: the recipe's arguments, the result, and messages of those that fail."""
 
 import json
 import os
 import sys
+import time
 from pathlib import Path
 from threading import Event
 
 import pytest
 
-from dynmap_rl.paper.cells import Cell
-from dynmap_rl.paper.launch import check_launcher, has_run, is_done, launch, run_cell
+from dynmap_rl.paper.cells import Run
+from dynmap_rl.paper.launch import check_launcher, execute, has_run, is_done, launch
 
-CELL = Cell("b", "generalize", ("--task", "bin_dropping"), needs="a")
+CELL = "bin_dropping", "joint", "recurrent", "Only-RGB"
+RUN = Run("b", "generalize", CELL, ("--task", "bin_dropping"), needs="a")
 FOLDERS = {"recipes": Path("/recipes"), "results": Path("results"), "runs": Path("runs")}
 
 
@@ -31,8 +33,8 @@ def scripts(monkeypatch):
     return calls
 
 
-def test_a_cell_is_a_run_of_its_recipe_whose_result_is_kept(scripts, tmp_path):
-    assert run_cell(CELL, **FOLDERS, threads=1, root=tmp_path) is None
+def test_the_result_of_a_run_is_kept(scripts, tmp_path):
+    assert execute(RUN, **FOLDERS, threads=1, root=tmp_path) is None
     script, arguments = scripts[0]
     assert script == Path("/recipes/generalize.py")
     assert " ".join(arguments) == "--task bin_dropping --run runs/b --compute.threads 1 --pretrained runs/a"
@@ -43,86 +45,105 @@ def test_a_cell_is_a_run_of_its_recipe_whose_result_is_kept(scripts, tmp_path):
 def test_a_result_that_is_there_stays(scripts, tmp_path):
     (tmp_path / "results").mkdir()
     (tmp_path / "results/b.json").write_text('{"run": 0}')
-    run_cell(CELL, **FOLDERS, root=tmp_path)
+    execute(RUN, **FOLDERS, root=tmp_path)
     assert json.loads((tmp_path / "results/b.json").read_text()) == {"run": 0}
 
 
 def test_presets_are_of_recipes(scripts, tmp_path):
     (tmp_path / "presets").mkdir()
     (tmp_path / "presets/generalize.yaml").touch()
-    run_cell(CELL, **FOLDERS, presets=Path("presets"), root=tmp_path)
-    run_cell(Cell("c", "joint"), **FOLDERS, presets=Path("presets"), root=tmp_path)
+    execute(RUN, **FOLDERS, presets=Path("presets"), root=tmp_path)
+    execute(Run("c", "joint", CELL), **FOLDERS, presets=Path("presets"), root=tmp_path)
     assert scripts[0][1][-2:] == ["--config_path", str(tmp_path / "presets/generalize.yaml")]
     assert "--config_path" not in scripts[1][1]
 
 
 @pytest.mark.parametrize(("output", "last"), [("a\nerror: b\n", "error: b"), ("", "no output")])
-def test_the_message_of_a_failed_cell_is_the_last_line_of_its_output(monkeypatch, tmp_path, output, last):
+def test_the_message_of_a_failed_run_is_the_last_line_of_its_output(monkeypatch, tmp_path, output, last):
     def run_script(script, arguments, folder, log):
         log.write_text(output)
         return 2
 
     monkeypatch.setattr("dynmap_rl.paper.launch.run_script", run_script)
-    message = run_cell(CELL, **FOLDERS, root=tmp_path)
+    message = execute(RUN, **FOLDERS, root=tmp_path)
     assert message == f"b failed; see runs/b.log, which ends with: {last}"
     assert not is_done("b", tmp_path / "results")
 
 
-CELLS = [Cell(name, "joint") for name in "abc"]
+RUNS = [Run(name, "joint", CELL) for name in "abc"]
 
 
-def fail_at_b(cell):
-    return "b failed" if cell.name == "b" else None
+def fail_at_b(run):
+    return "b failed" if run.name == "b" else None
 
 
-def test_cells_that_fail_do_not_stop_the_others(capsys):
-    assert launch(CELLS, fail_at_b) == ["b failed"]
+def test_runs_that_fail_do_not_stop_the_others(capsys):
+    assert launch(RUNS, fail_at_b) == ["b failed"]
     assert capsys.readouterr().out.splitlines() == ["done: a", "done: c"]
     assert launch([], fail_at_b) == []
 
 
 def test_workers_run_at_the_same_time():
-    begun = {cell.name: Event() for cell in CELLS}
+    begun = {run.name: Event() for run in RUNS}
 
-    def wait_for_others(cell):
-        begun[cell.name].set()
+    def wait_for_others(run):
+        begun[run.name].set()
         return None if all(event.wait(20) for event in begun.values()) else "alone"
 
-    assert launch(CELLS, wait_for_others, workers=3) == []
+    assert launch(RUNS, wait_for_others, workers=3) == []
 
 
-def test_an_interrupt_begins_no_other_cell():
+def test_a_run_waits_for_the_world_model_that_it_needs():
+    runs, done = [RUNS[0], Run("d", "generalize", CELL, needs="a/seed_1"), RUNS[2]], []
+
+    def start(run):
+        if run.name == "a":
+            time.sleep(0.2)
+        done.append(run.name)
+
+    assert launch(runs, start, workers=3) == []
+    assert done.index("a") < done.index("d")
+
+
+def test_a_run_does_not_start_without_the_world_model_that_it_needs(capsys):
+    needing = Run("d", "generalize", CELL, needs="b")
+    messages = launch([*RUNS, needing], fail_at_b, workers=2)
+    assert sorted(messages) == ["b failed", "d needs the world model of a failed run"]
+    assert sorted(capsys.readouterr().out.splitlines()) == ["done: a", "done: c"]
+
+
+def test_an_interrupt_begins_no_other_run():
     begun = []
 
-    def interrupt(cell):
-        begun.append(cell.name)
+    def interrupt(run):
+        begun.append(run.name)
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        launch(CELLS[:1], interrupt)
+        launch(RUNS[:1], interrupt)
     assert begun == ["a"]
 
 
 def test_launchers_are_checked(monkeypatch):
     check_launcher("local")
     with pytest.raises(ValueError, match="got 'slurm'"):
-        launch(CELLS, fail_at_b, "slurm")
+        launch(RUNS, fail_at_b, "slurm")
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ValueError, match=r"pip install '\.\[ray\]'"):
-        launch(CELLS, fail_at_b, "ray")
+        launch(RUNS, fail_at_b, "ray")
 
 
 @pytest.mark.slow
-def test_ray_reports_a_cell_whose_process_died(monkeypatch):
+def test_ray_reports_a_run_whose_process_died(monkeypatch):
     ray = pytest.importorskip("ray")
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
 
-    def die_at_b(cell):
-        return os._exit(1) if cell.name == "b" else None
+    def die_at_b(run):
+        return os._exit(1) if run.name == "b" else None
 
     try:
-        messages = launch(CELLS, die_at_b, "ray", cpus=1)
+        messages = launch(RUNS, die_at_b, "ray", cpus=1)
     finally:
         ray.shutdown()
     assert messages == ["b was lost by Ray (WorkerCrashedError); the same command resumes"]

@@ -9,7 +9,7 @@ import pytest
 from dynmap_rl.evaluation.protocol import result_rows
 from dynmap_rl.evaluation.statistics import shared_interval
 from dynmap_rl.paper import page
-from dynmap_rl.paper.cells import list_cells
+from dynmap_rl.paper.cells import list_runs
 from dynmap_rl.paper.page import (
     MARKS,
     markdown_page,
@@ -18,35 +18,14 @@ from dynmap_rl.paper.page import (
     replace_block,
     write_results_page,
 )
-from dynmap_rl.paper.results import COLUMNS, ROWS, read_cells
-from dynmap_rl.paper.tables import markdown_tables, table_rows
 from dynmap_rl.utils.files import read_json
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "recipes/results"
 
 
-@pytest.fixture(scope="module")
-def cells():
-    return read_cells(RESULTS / "cells")
-
-
-@pytest.mark.slow
 def test_the_readme_of_the_results_is_generated():
     assert (RESULTS / "README.md").read_text() == markdown_page(RESULTS)
-
-
-def test_all_but_the_comparisons_of_that_readme_is_generated(monkeypatch):
-    """Without the comparisons, which take long to compute."""
-    monkeypatch.setattr(page, "compare_cells", lambda results: [])
-    found, expected = (
-        (RESULTS / "README.md").read_text().split("\n## "),
-        markdown_page(RESULTS).split("\n## "),
-    )
-    assert len(found) == len(expected)
-    assert [a.split("\n")[0] for a, b in zip(found, expected, strict=True) if a != b] == [
-        "The paper's claims"
-    ]
 
 
 def test_the_table_of_the_main_readme_is_generated():
@@ -58,37 +37,17 @@ def test_everything_is_described():
     contents = read_json(RESULTS / "contents.json")
     for name in ("measurements", "media"):
         assert set(contents[name]) == {path.name for path in (RESULTS / name).iterdir()}
-    assert {path.stem for path in (RESULTS / "cells").iterdir()} == {cell.name for cell in list_cells()}
+    assert {path.stem for path in (RESULTS / "cells").glob("*.json")} <= {run.name for run in list_runs()}
     for path in re.findall(r"\]\((\w+/[\w.]+)\)", (RESULTS / "README.md").read_text()):
         assert (RESULTS / path).exists(), path
 
 
-def test_stored_intervals_are_those_of_the_episodes(cells):
-    for result in list(cells.values())[::6]:
+def test_stored_intervals_are_those_of_the_episodes():
+    for path in sorted((RESULTS / "cells").glob("*.json"))[::6]:
+        result = read_json(path)
         for name, outcome in (("SR_interval", "success"), ("DR_interval", "dropped")):
             expected = shared_interval(result_rows(result), outcome)
             assert result["test_protocol"][name] == pytest.approx(expected), result["command"]
-
-
-def test_tables_hold_every_cell_of_the_paper(cells):
-    rows = table_rows(RESULTS / "cells")
-    assert len(rows) == len(cells) == 59
-    main = next(r for r in rows if r["column"] == "decoupled, recurrent" and r["row"] == "RGB+[P+V]")
-    assert (main["table"], main["n"], len(main["policies"])) == ("I", 3000, 3)
-    assert main["paper"]["SR"] == (89, 0.9) and main["interval"][0] < main["SR"] < main["interval"][1]
-    text = markdown_tables(RESULTS / "cells")
-    assert sum(
-        line.startswith(tuple(f"| {row} |" for row in ROWS)) for line in text.splitlines()
-    ) == 59 + len(ROWS)
-    assert text.count("\nTable ") == sum(map(len, COLUMNS.values()))
-
-
-def test_a_cell_without_the_papers_protocol_or_result_is_a_dash(tmp_path, cells):
-    result = cells["bin_dropping", "joint", "recurrent", "RGB+[V]"] | {"paper_protocol": None}
-    (tmp_path / "cell.json").write_text(json.dumps(result))
-    lines = markdown_tables(tmp_path).splitlines()
-    assert any(line.startswith("| RGB+[V] | 40 (2.8) | - | **") for line in lines)
-    assert any(line.startswith("| Only-RGB | 21 / - | 73 / - |") for line in lines)
 
 
 def test_perception_is_a_row_for_each_model_and_dataset():

@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 from commands import run
+from made_up import make_rows
 from PIL import Image
 
 from dynmap_rl.data.demonstrations import load_meta
 from dynmap_rl.evaluation.rollout import scene_seeds
 from dynmap_rl.modules.checkpoints import make_policy, make_world_model, save_policy, save_world_model
-from dynmap_rl.paper.cells import list_cells
+from dynmap_rl.paper.cells import list_runs
 from dynmap_rl.paper.figures import loss_panels
 from dynmap_rl.runs.folder import append_metrics
 from dynmap_rl.utils.files import read_json, write_json
@@ -28,7 +29,11 @@ def make_run(folder, constants, supervision, policy):
     save_world_model(folder / "world_model", model)
     save_policy(folder / "seed_0" / "policy", make_policy(constants, policy, model, width=8), model)
     append_metrics(folder / "seed_0", 100, loss=0.2, held_out_loss=0.1)
-    write_json(folder / "eval.json", {"seeds": [0]})
+    rows = make_rows(2, count=3) | {"dropped": "000", "touched": "000"}
+    rows |= {"first_scene_seed": scene_seeds("test", 1)[0]}
+    source = {"task": "balance_reaching", "training": "decoupled"}
+    facts = {"task": "balance_reaching", "row": "RGB+[P]", "policy": policy, "world_model": source}
+    write_json(folder / "eval.json", facts | {"seeds": [0], "results": [{"test": {"rows": rows}}]})
 
 
 @pytest.fixture(scope="module")
@@ -54,10 +59,15 @@ def few_episodes(monkeypatch):
 def test_draws_every_figure(runs, recordings, few_episodes, tmp_path, capsys):
     datasets = ",".join(str(recordings(task)) for task in ("balance_reaching", "bin_dropping"))
     main(Config(runs=runs, output=tmp_path, datasets=datasets))
-    names = {"distributions", "fig7_training", *(f"fig{number}" for number in (2, 3, 4, 6, 7, 8, 9))}
+    names = {
+        "distributions",
+        "failures",
+        "fig7_training",
+        *(f"fig{number}" for number in (2, 3, 4, 6, 7, 8, 9)),
+    }
     assert {path.stem for path in tmp_path.glob("*.png")} == names
     page = (tmp_path / "report.html").read_text()
-    assert page.count("data:image/png") == 8 and "Fig. 7: policy losses" in page and "drawn: fig2, " in page
+    assert page.count("data:image/png") == 9 and "Fig. 7: policy losses" in page and "drawn: fig2, " in page
     text = capsys.readouterr().out
     for name in names:
         assert is_drawn(tmp_path / f"{name}.png"), name
@@ -100,6 +110,14 @@ def test_a_dataset_that_a_figure_lacks_is_named(runs, recording, tmp_path):
     assert is_drawn(tmp_path / "fig4.png")
 
 
+def test_failures_of_the_runs_that_are_there_are_drawn(runs, tmp_path, capsys):
+    main(Config(runs=runs, output=tmp_path, only="failures"))
+    assert is_drawn(tmp_path / "failures.png") and "2 of 8 runs are there" in capsys.readouterr().out
+    found = read_json(tmp_path / "failures.json")["failures"]
+    assert [(one["policy"], one["episodes"]) for one in found] == [("feedforward", 3), ("recurrent", 3)]
+    assert all(sum(map(len, one["scenes"].values())) == 1 for one in found)
+
+
 @pytest.mark.slow
 def test_what_is_there_is_drawn(runs, few_episodes, tmp_path, capsys):
     part = tmp_path / "runs"
@@ -121,6 +139,6 @@ def test_an_unknown_figure_gets_one_clear_line(tmp_path):
 
 
 def test_all_runs_are_cells_of_the_tables():
-    cells = {cell.name for cell in list_cells()}
+    cells = {run.name for run in list_runs()}
     groups = [names for panel in loss_panels("balance_reaching").values() for names in panel.values()]
     assert {WORLD_MODEL, *POLICIES.values(), *(name for names in groups for name in names)} <= cells

@@ -1,4 +1,4 @@
-"""The grid of the paper's tables: choice of the cells, their runs, and the printed tables."""
+"""The grid of the paper's tables: choice of the runs, their results, and the printed tables."""
 
 import json
 import os
@@ -13,12 +13,13 @@ import commands
 import pytest
 from filelock import FileLock
 
-from dynmap_rl.paper.cells import list_cells
+from dynmap_rl.paper.cells import list_runs
 from recipes.paper import tables
 
 RECIPE = Path(tables.__file__)
 TASKS = "balance_reaching", "balance_reaching_obstacle", "bin_dropping"
 NAMES = [f"{task}_joint_none_recurrent" for task in TASKS]
+ALL = [run.name for run in list_runs() if "_joint_none_" in run.name]  # in the order of the grid
 SMALL = "--results", "results", "--presets", str(commands.PRESETS)
 
 
@@ -27,7 +28,7 @@ def run(folder, *arguments):
 
 
 def done(result) -> list[str]:
-    """Cells that the recipe has run."""
+    """Runs that the recipe has executed."""
     lines = result.stdout.splitlines()
     return [line.removeprefix("done: ") for line in lines if line.startswith("done: ")]
 
@@ -38,17 +39,19 @@ def listed(folder, *arguments):
 
 
 def test_a_table_is_chosen_with_the_world_models_that_it_needs(tmp_path):
-    by_name = {cell.name: cell for cell in list_cells()}
+    by_name = {run.name: run for run in list_runs()}
     for table, task in zip(("I", "II", "III"), TASKS, strict=True):
         found, said = listed(tmp_path, "--table", table)
-        cells = {name for name, cell in by_name.items() if cell.task == task}
-        assert found == cells | ({by_name[name].needs for name in cells} - {None})
+        runs = {name for name, run in by_name.items() if run.table == table}
+        assert {by_name[name].task for name in runs} == {task}
+        assert found == runs | ({by_name[name].source for name in runs} - {None})
         assert f"about {sum(by_name[name].minutes for name in found) / 60:.1f} hours" in said
-    assert listed(tmp_path, "--table", "I,II,III") == listed(tmp_path) and len(listed(tmp_path)[0]) == len(
-        by_name
-    )
-    assert listed(tmp_path, "--table", "II,III", "--only", "joint_none")[0] == set(NAMES)
+    assert listed(tmp_path)[0] == set(by_name)
+    assert listed(tmp_path, "--table", "II,III", "--only", "joint_none")[0] == set(ALL)
     assert listed(tmp_path, "--table", "I", "--only", "joint_none")[0] == set(NAMES[:1])
+    found = listed(tmp_path, "--table", "extra", "--only", "plain_none_feedforward")[0]
+    assert found == {f"balance_reaching_plain_none_{kind}{seed}" for kind in ("recurrent", "feedforward")
+                     for seed in ("", "_world_model_1", "_world_model_2")}  # fmt: skip
 
 
 def fake_script(calls):
@@ -58,7 +61,7 @@ def fake_script(calls):
         given = dict(zip(arguments[::2], arguments[1::2], strict=True))
         calls.append((script.stem, given))
         log.write_text("error: no luck\n")
-        if "unlucky" in os.environ.get("CELLS", "") and given["--run"].endswith(NAMES[0]):
+        if "unlucky" in os.environ.get("RUNS", "") and given["--run"].endswith(NAMES[0]):
             return 2
         task = given.get("--task", TASKS[0])
         run, flags = folder / given["--run"], {"success": "110", "dropped": "000", "touched": "000"}
@@ -67,9 +70,10 @@ def fake_script(calls):
         run.mkdir(parents=True)
         (run / "eval.json").write_text(json.dumps({
             "task": task, "policy": "recurrent", "row": "Only-RGB", "settings": {"world_model": {"seed": 0}},
-            "world_model": {"task": TASKS[0], "training": "joint"}, "results": [{"test": {"rows": rows}}],
+            "world_model": {"task": TASKS[0], "training": "joint"},
+            "results": [{"test": {"rows": rows}, "paper": {"rows": rows}}],
             "test_protocol": metrics | {"episodes": 3}, "paper_protocol": {k: (v, 0.0) for k, v in metrics.items()},
-            "seeds": [0], "command": "python x.py",
+            "seeds": [0], "command": "python x.py", "world_model_sha256": None if script.stem == "joint" else "0",
         }))  # fmt: skip
         return 0
 
@@ -88,28 +92,32 @@ def calls(monkeypatch, recordings, tmp_path):
 def test_cells_run_once_and_are_printed_beside_the_paper(calls, tmp_path):
     result = run(tmp_path, "--only", "joint_none")
     assert result.returncode == 0, result.stderr
-    assert done(result) == NAMES
-    assert [recipe for recipe, _ in calls] == ["joint", "generalize", "generalize"]
-    assert {given["--pretrained"] for _, given in calls[1:]} == {f"runs/tables/{NAMES[0]}"}
+    assert done(result) == ALL and ALL[:3] == NAMES
+    assert [recipe for recipe, _ in calls] == ["joint"] + ["generalize"] * 6
+    source = f"runs/tables/{NAMES[0]}"
+    expected = [source, source, *[f"{source}/seed_1"] * 2, *[f"{source}/seed_2"] * 2]
+    assert [given["--pretrained"] for _, given in calls[1:]] == expected
     assert {given["--compute.threads"] for _, given in calls} == {"2"}
     assert calls[0][1]["--config_path"] == str(commands.PRESETS / "joint.yaml")
-    assert "| Only-RGB | 46 (1.6) | " in (tmp_path / "runs/tables/report.html").read_text()
-    assert sorted(path.stem for path in (tmp_path / "results").iterdir()) == sorted(NAMES)
+    assert (
+        "| Only-RGB | 46 (1.6) | 67 (0.0) | **66.7** [" in (tmp_path / "runs/tables/report.html").read_text()
+    )
+    assert sorted(path.stem for path in (tmp_path / "results").iterdir()) == sorted(ALL)
 
     rows = json.loads(run(tmp_path, "--print", "json").stdout)
     assert [(r["table"], r["row"], r["column"], r["n"]) for r in rows] == [
-        (table, "Only-RGB", "joint, recurrent", 3) for table in ("I", "II", "III")
+        (table, "Only-RGB", "joint, recurrent", 3 if table == "I" else 9) for table in ("I", "II", "III")
     ]
-    assert "| Only-RGB | 64 (5.9); 17, 92 |" in run(tmp_path, "--print", "markdown").stdout
+    assert "| Only-RGB | 64 (5.9); 17, 92 | 67 (0.0); 0, 10 |" in run(tmp_path, "--print", "markdown").stdout
     assert run(tmp_path, "--print", "findings").returncode == 0
-    assert run(tmp_path, "--dry_run").stdout.count("   done  ") == 3
+    assert run(tmp_path, "--dry_run").stdout.count("   done  ") == len(ALL)
 
 
 def test_only_cells_without_a_result_run_and_the_world_models_that_they_need(calls, tmp_path):
     run(tmp_path, "--only", "joint_none")
     (tmp_path / f"results/{NAMES[2]}.json").unlink()
     (tmp_path / f"runs/tables/{NAMES[2]}").rename(tmp_path / "old")
-    assert done(run(tmp_path, "--only", "joint_none")) == NAMES[2:]
+    assert done(run(tmp_path, "--only", "joint_none")) == NAMES[2:3]
     assert done(run(tmp_path, "--only", "joint_none")) == []
     (tmp_path / "runs").rename(tmp_path / "runs_of_old")  # results are there, but no runs
     (tmp_path / f"results/{NAMES[2]}.json").unlink()
@@ -117,22 +125,22 @@ def test_only_cells_without_a_result_run_and_the_world_models_that_they_need(cal
 
 
 def test_a_failed_cell_is_reported_with_those_that_need_it(calls, tmp_path, monkeypatch):
-    monkeypatch.setenv("CELLS", "unlucky")
+    monkeypatch.setenv("RUNS", "unlucky")
     result = run(tmp_path, "--only", "joint_none", "--workers", "2")
     assert result.returncode == 2 and calls[0][1]["--compute.threads"] == "1"
-    assert (
-        f"{NAMES[0]} failed; see runs/tables/{NAMES[0]}.log, which ends with: error: no luck" in result.stderr
-    )
+    message = f"{NAMES[0]} failed; see runs/tables/{NAMES[0]}.log, which ends with: error: no luck"
+    assert message in result.stderr and len(calls) == 1
     assert NAMES[2] in result.stderr and len(result.stderr.splitlines()) == 1
 
 
 @pytest.mark.slow
 def test_real_cells(recordings, tmp_path):
     commands.place_recordings(tmp_path, recordings, *TASKS)
-    result = run(tmp_path, "--only", "joint_none")
-    assert done(result) == NAMES, result.stderr
+    for name in NAMES[1:]:
+        result = run(tmp_path, "--only", name)
+        assert done(result)[-1] == name, result.stderr
     rows = json.loads(run(tmp_path, "--print", "json").stdout)
-    assert [row["n"] for row in rows] == [3, 3, 3]
+    assert [row["n"] for row in rows] == [3, 3]
 
 
 @pytest.mark.slow

@@ -40,6 +40,14 @@ def test_the_world_model_of_a_run_with_its_origin(run):
         load_source(run / "seed_0")
 
 
+def test_the_world_model_of_one_seed_of_a_joint_run(run):
+    write_json(run / "eval.json", {"world_model": {"task": OURS, "training": "joint"}})
+    (run / "world_model").rename(run / "seed_0/world_model")
+    for folder in (run / "seed_0", run / "seed_0/world_model"):
+        model, source = load_source(folder)
+        assert source == {"task": OURS, "training": "joint"} and model.supervision
+
+
 def test_a_joint_run_has_a_world_model_for_each_seed(run):
     before = fingerprint(load_actor(run).world_model)
     own = shutil.copytree(run / "world_model", run / "seed_0/world_model")

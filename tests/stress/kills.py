@@ -4,7 +4,7 @@
     uv run python tests/stress/kills.py expert -n 5
 
 Every process of the recipe gets SIGKILL. In the end these must be the same: every number of a dataset and its metadata,
-every weight, every metric but the wall-clock time, every row of every cell. Finished shards, policies, cells and saved
+every weight, every metric but the wall-clock time, every row of every result. Finished shards, policies, runs and saved
 updates must not be made again. The script ends with an error where anything differs; otherwise it writes the counts to
 ``recipes/results/measurements/kills.json``, where recipes that were not named stay as they are.
 """
@@ -30,11 +30,12 @@ from dynmap_rl.utils.files import read_json, write_json
 
 TESTS = Path(__file__).parents[1]
 RECIPES, PRESETS = TESTS.parent / "recipes", TESTS / "presets"
+RUN = "balance_reaching_obstacle_joint_none_recurrent"  # with the run whose world model it needs
 COMMANDS = {
     "collect": "--episodes 60 --eval_episodes 10",
     "expert": f"--config_path {PRESETS}/expert.yaml --ppo.iterations 12 --ppo.checkpoint_every 2",
     "decoupled": f"--config_path {PRESETS}/decoupled.yaml --seeds 0,1 --world_model.updates 600",  # saved every 250
-    "paper/tables": f"--presets {PRESETS} --only joint_none --results results",
+    "paper/tables": f"--presets {PRESETS} --only {RUN} --results results",
 }
 RESULTS = RECIPES / "results/measurements/kills.json"
 LEFT_OUT = {"seconds", "command"}  # wall-clock time

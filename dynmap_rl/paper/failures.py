@@ -1,0 +1,99 @@
+"""Failures by cause: table and figure."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dynmap_rl.evaluation.failures import CAUSES, failure_causes
+from dynmap_rl.evaluation.protocol import result_rows
+from dynmap_rl.evaluation.rollout import roll_out
+from dynmap_rl.reporting.figures import plt, save_figure
+from dynmap_rl.runs.lookup import load_actor
+from dynmap_rl.utils.files import read_json
+
+from .cells import TASKS
+from .tables import join_table
+
+RUNS = [  # runs whose failures are shown
+    f"{TASKS[0]}_decoupled_none_feedforward",
+    f"{TASKS[0]}_decoupled_none_recurrent",
+    f"{TASKS[0]}_decoupled_position_velocity_feedforward",
+    *(f"{task}_decoupled_position_velocity_recurrent" for task in TASKS),
+    f"{TASKS[0]}_joint_position_velocity_recurrent",
+    f"{TASKS[0]}_end_to_end_recurrent",
+]
+REPEATED = "succeeds when repeated"  # frames in other batches differ in their last bits
+
+
+def find_failures(run: Path) -> dict:
+    """Run the failed episodes of a run's first policy again, and find their causes.
+
+    Args:
+        run: folder of a complete run.
+
+    Returns:
+        ``task``, ``row``, ``policy``, number of ``episodes``, and ``scenes``, the scene seeds by cause.
+    """
+    result = read_json(run / "eval.json")
+    rows = result_rows(result)[0]
+    seeds, scenes = [row["scene_seed"] for row in rows if not row["success"]], {}
+    if seeds:
+        episodes = roll_out(load_actor(run, result["seeds"][0]), result["task"], seeds)
+        for seed, cause in zip(seeds, failure_causes(episodes, result["task"]), strict=True):
+            scenes.setdefault(cause or REPEATED, []).append(seed)
+    facts = {name: result[name] for name in ("task", "row", "policy")}
+    return facts | {"training": result["world_model"]["training"], "episodes": len(rows), "scenes": scenes}
+
+
+def plot_failures(failures: list[dict], path: Path) -> None:
+    """Draw a bar for each run, the share of failed episodes (%) by cause.
+
+    Args:
+        failures: results of :func:`find_failures`.
+        path: file to write.
+    """
+    figure, axis = plt.subplots(figsize=(10, 1.6 + 0.4 * len(failures)), layout="constrained")
+    names, left = [_title(one) for one in failures], [0.0] * len(failures)
+    colors = plt.get_cmap("tab20").colors
+    for number, cause in enumerate(_causes(failures)):
+        shares = [_share(one, cause) for one in failures]
+        axis.barh(range(len(names)), shares, left=left, color=colors[number], label=cause)
+        left = [start + share for start, share in zip(left, shares, strict=True)]
+    axis.set_yticks(range(len(names)), names, fontsize=8)
+    axis.invert_yaxis()
+    axis.set_xlabel("failed episodes [%]", fontsize=9)
+    axis.set_xlim(0, max([*left, 1.0]))
+    if any(left):
+        axis.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    save_figure(figure, path)
+
+
+def markdown_failures(failures: list[dict]) -> str:
+    """Return a table of the shares of failed episodes (%) by cause.
+
+    Args:
+        failures: results of :func:`find_failures`.
+    """
+    causes = _causes(failures)
+    rows = [
+        [
+            _title(one),
+            f"{100 * sum(map(len, one['scenes'].values())) / one['episodes']:.1f}",
+            *(f"{_share(one, cause):.1f}" if cause in one["scenes"] else "" for cause in causes),
+        ]
+        for one in failures
+    ]
+    return join_table(["% of the episodes", "fail", *causes], rows)
+
+
+def _causes(failures: list[dict]) -> list[str]:
+    return [cause for cause in (*CAUSES, REPEATED) if any(cause in one["scenes"] for one in failures)]
+
+
+def _share(one: dict, cause: str) -> float:
+    return 100 * len(one["scenes"].get(cause, [])) / one["episodes"]
+
+
+def _title(one: dict) -> str:
+    training = "" if one["training"] == "end_to_end" else f", {one['training']}"
+    return f"{one['task']}: {one['row']}{training}, {one['policy']}"

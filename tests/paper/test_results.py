@@ -1,0 +1,56 @@
+"""Cells, merged from the results of their runs."""
+
+import pytest
+from made_up import TASK, write
+from scipy.stats import t
+
+from dynmap_rl.paper.results import count_commits, read_cells
+
+KEY = TASK, "decoupled", "recurrent", "RGB+[P]"
+
+
+def test_a_cell_merges_the_runs_that_are_there(tmp_path):
+    assert not read_cells(tmp_path)[KEY].results and read_cells(tmp_path)[KEY].missing == 3
+    write(tmp_path, "RGB+[P]", 40, 30)
+    cell = read_cells(tmp_path)[KEY]
+    assert (len(cell.results), cell.missing, len(cell.policies)) == (2, 1, 6)
+    assert cell.rates() == [100.0, 75.0] and cell.summary["SR"] == 87.5
+    assert cell.summary["episodes"] == 6 * 40
+    assert cell.protocol["SR"] == (87.5, 12.5)
+    low, high = cell.summary["SR_interval"]
+    assert low < 87.5 < high
+
+
+def test_the_interval_over_world_models_is_students(tmp_path):
+    write(tmp_path, "RGB+[P]", 20, 24, 28)
+    summary = read_cells(tmp_path)[KEY].summary
+    half = t.ppf(0.975, 2) * 10 / 3**0.5
+    assert summary["world_model_interval"] == pytest.approx((60 - half, 60 + half))
+    write(tmp_path / "one", "RGB+[P]", 20)
+    assert read_cells(tmp_path / "one")[KEY].summary["world_model_interval"] is None
+
+
+def test_every_seed_of_joint_training_has_a_world_model(tmp_path):
+    write(tmp_path, "RGB+[P]", 20, 30, 40, training="joint")
+    cell = read_cells(tmp_path)[TASK, "joint", "recurrent", "RGB+[P]"]
+    assert cell.rates() == [50.0, 75.0, 100.0] and not cell.missing
+
+
+def test_an_interval_over_world_models_that_agree_is_a_point(tmp_path):
+    write(tmp_path, "RGB+[P]", 40, 40, 40)
+    assert read_cells(tmp_path)[KEY].summary["world_model_interval"] == (100.0, 100.0)
+
+
+def test_commits_are_counted_by_run(tmp_path):
+    write(tmp_path, "RGB+[P]", 40, 30, commit="abc")
+    write(tmp_path, "RGB+[V]", 40, commit="def")
+    assert count_commits(read_cells(tmp_path).values()) == {"abc": 2, "def": 1}
+
+
+def test_rows_that_the_paper_lacks_are_of_other_tables(tmp_path):
+    row = "RGB+[P+V], plain CNN"
+    write(tmp_path, row, 40)
+    assert (TASK, "decoupled", "recurrent", row) not in read_cells(tmp_path)
+    cell = read_cells(tmp_path, ["extra"])[TASK, "decoupled", "recurrent", row]
+    assert cell.published is None and cell.summary["SR"] == 100.0
+    assert read_cells(tmp_path)[KEY].published["SR"] == (92, 4.3)
