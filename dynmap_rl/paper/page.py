@@ -16,6 +16,7 @@ from .tables import OWN, join_table, markdown_column, markdown_overview, markdow
 
 UNITS = {"DR": "%", "PE": "mm"}
 PERCEPTION = "object_error", "chroma_explained", "goal_explained", "background_error"
+MAIN = "RGB+[P+V]", "Only-RGB"  # rows of the table in the main README
 MARKS = "<!-- results -->", "<!-- /results -->"
 COMMAND = "python recipes/paper/tables.py --write"
 PAGE = """# Results
@@ -85,9 +86,8 @@ named after the place and the cart's speed when the block began to tip; the caus
 
 ## What world models see
 
-One-step predictions of two datasets: held-out demonstrations, and the expert's first ten steps in
-validation scenes, where the cart is away from the goal. Colour error: root mean square on the pixels of cart and block (of
-0 to 1). Chroma: share of the variation of the objects' chroma that is explained. Goal: share of the marker's difference
+One-step predictions of two datasets: held-out demonstrations, and the expert's first ten steps in validation scenes, where
+the cart is away from the goal. Colour error: root mean square on the pixels of cart and block (of 0 to 1). Chroma: share of the variation of the objects' chroma that is explained. Goal: share of the marker's difference
 from the background. Background: root mean square error on all other pixels. Cart: distance of a linear map of the latent.
 Open loop: distance of the decoded positions of cart and block after two seconds without frames.
 
@@ -149,39 +149,31 @@ def markdown_perception(probe: dict) -> str:
     return join_table(head, lines)
 
 
-def markdown_runs(measurements: Path) -> str:
-    """Return a table of the runs in a folder of measurements, ``v1_*.json``, and of the careless baseline."""
+def markdown_runs(results: Path) -> str:
+    """Return a table of the decoupled cells of RGB+[P+V] and Only-RGB that have a run, and of the careless baseline.
+
+    Args:
+        results: see :func:`markdown_page`.
+    """
     lines = []
-    for path in sorted(measurements.glob("v1_*.json")):
-        run, reported = read_json(path), METRICS[read_json(path)["task"]]
-        test, (low, high) = run["test_protocol"], run["test_protocol"]["SR_interval"]
-        others = (f"{test[name]:.1f}" if name in reported else "" for name in UNITS)
-        who = f"{run['row']}, {run['policy']}"
-        scenes = f"{test['episodes']:,} {run['settings']['eval']['split']}"
-        lines.append(
-            [run["task"], who, scenes, *others, f"**{test['SR']:.1f}** [{low:.1f}, {high:.1f}]", _link(path)]
-        )
-    for path in sorted(measurements.glob("careless_*.json")):
+    for (task, training, policy, row), cell in read_cells(results / "cells", TABLES[:4]).items():
+        if training != "decoupled" or row.split(",")[0] not in MAIN or not cell.results:
+            continue
+        summary, reported = cell.summary, METRICS[task]
+        low, high = summary["SR_interval"]
+        others = (f"{summary[name]:.1f}" if name in reported else "" for name in UNITS)
+        rate = f"**{summary['SR']:.1f}** [{low:.1f}, {high:.1f}]"
+        count = str(len(summary["world_models"]))
+        lines.append([task, f"{row}, {policy}", count, f"{summary['episodes']:,}", *others, rate])
+    for path in sorted((results / "measurements").glob("careless_*.json")):
         run = read_json(path)
-        rates, scenes = run["rates"], f"{run['episodes']:,} {run['split']}"
-        lines.append(
-            [
-                run["task"],
-                "careless",
-                scenes,
-                f"{rates['dropped']:.1f}",
-                "",
-                f"{rates['success']:.1f}",
-                _link(path),
-            ]
-        )
+        rates, count = run["rates"], f"{run['episodes']:,}"
+        lines.append([
+            run["task"], "careless", "", count, f"{rates['dropped']:.1f}", "", f"{rates['success']:.1f}",
+        ])  # fmt: skip
     lines.sort(key=lambda line: TASKS.index(line[0]))
     rows = [[str(1 + TASKS.index(task)), *line] for task, *line in lines]
-    return join_table(["task", "world model, policy", "episodes", "DR %", "PE mm", "SR %", ""], rows)
-
-
-def _link(path: Path) -> str:
-    return f"[file](recipes/results/measurements/{path.name})"
+    return join_table(["task", "world model, policy", "world models", "episodes", "DR %", "PE mm", "SR %"], rows)
 
 
 def replace_block(text: str, block: str) -> str:
@@ -204,7 +196,7 @@ def write_results_page(results: Path, readme: Path) -> list[Path]:
     """
     pages = {results / "README.md": markdown_page(results)}
     if readme.exists():
-        pages[readme] = replace_block(readme.read_text(), markdown_runs(results / "measurements"))
+        pages[readme] = replace_block(readme.read_text(), markdown_runs(results))
     changed = [path for path, text in pages.items() if not path.exists() or path.read_text() != text]
     for path in changed:
         write_bytes(path, pages[path].encode())

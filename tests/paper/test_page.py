@@ -3,6 +3,7 @@
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -30,7 +31,7 @@ def test_the_readme_of_the_results_is_generated():
 
 def test_the_table_of_the_main_readme_is_generated():
     text = (ROOT / "README.md").read_text()
-    assert text == replace_block(text, markdown_runs(RESULTS / "measurements")) and MARKS[0] in text
+    assert text == replace_block(text, markdown_runs(RESULTS)) and MARKS[0] in text
 
 
 def test_everything_is_described():
@@ -64,20 +65,25 @@ def test_perception_is_a_row_for_each_model_and_dataset():
     assert len(lines) == 4 and all(line.endswith("| 12.0 mm |  |") for line in lines[1:])
 
 
-def test_runs_and_the_careless_baseline_are_rows(tmp_path):
+def test_main_cells_and_the_careless_baseline_are_rows(tmp_path, monkeypatch):
     summary = {"episodes": 3000, "DR": 1.0, "PE": 12.34, "SR": 97.0, "SR_interval": [96.0, 98.0]}
-    run = {"task": "bin_dropping", "row": "Only-RGB", "policy": "recurrent", "test_protocol": summary}
-    (tmp_path / "v1_x.json").write_text(json.dumps(run | {"settings": {"eval": {"split": "validation"}}}))
-    rates = {
-        "task": "balance_reaching",
-        "rates": {"dropped": 90.6, "success": 9.4},
-        "episodes": 1000,
-        "split": "test",
+    done = SimpleNamespace(results=[{}], summary=summary | {"world_models": [97.0]})
+    cells = {
+        ("bin_dropping", "decoupled", "recurrent", "Only-RGB"): done,
+        ("bin_dropping", "joint", "recurrent", "Only-RGB"): done,
+        ("bin_dropping", "decoupled", "recurrent", "RGB+[A]"): done,
+        ("balance_reaching", "decoupled", "recurrent", "RGB+[P+V], plain CNN"): done,
+        ("balance_reaching", "decoupled", "recurrent", "RGB+[P+V]"): SimpleNamespace(results=[]),
     }
-    (tmp_path / "careless_x.json").write_text(json.dumps(rates))
-    first, second = markdown_runs(tmp_path).splitlines()[2:]
-    assert first.startswith("| 1 | careless | 1,000 test | 90.6 |  | 9.4 | ")
-    assert second.startswith("| 3 | Only-RGB, recurrent | 3,000 validation |  |  | **97.0** [96.0, 98.0] | ")
+    monkeypatch.setattr(page, "read_cells", lambda *_: cells)
+    rates = {"task": "balance_reaching", "rates": {"dropped": 90.6, "success": 9.4}, "episodes": 1000}
+    (tmp_path / "measurements").mkdir()
+    (tmp_path / "measurements/careless_x.json").write_text(json.dumps(rates))
+    assert markdown_runs(tmp_path).splitlines()[2:] == [
+        "| 1 | RGB+[P+V], plain CNN, recurrent | 1 | 3,000 | 1.0 | 12.3 | **97.0** [96.0, 98.0] |",
+        "| 1 | careless |  | 1,000 | 90.6 |  | 9.4 |",
+        "| 3 | Only-RGB, recurrent | 1 | 3,000 |  |  | **97.0** [96.0, 98.0] |",
+    ]
 
 
 def test_only_the_block_between_the_marks_is_replaced(tmp_path, monkeypatch):
