@@ -173,7 +173,9 @@ def markdown_runs(results: Path) -> str:
         ])  # fmt: skip
     lines.sort(key=lambda line: TASKS.index(line[0]))
     rows = [[str(1 + TASKS.index(task)), *line] for task, *line in lines]
-    return join_table(["task", "world model, policy", "world models", "episodes", "DR %", "PE mm", "SR %"], rows)
+    return join_table(
+        ["task", "world model, policy", "world models", "episodes", "DR %", "PE mm", "SR %"], rows
+    )
 
 
 def replace_block(text: str, block: str) -> str:
