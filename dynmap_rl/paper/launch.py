@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from importlib.util import find_spec
 from pathlib import Path
 
+from dynmap_rl.utils.cluster import check_launcher, run_by_ray
 from dynmap_rl.utils.files import read_json, write_json
 from dynmap_rl.utils.processes import run_script
 
 from .cells import Cell
-
-LAUNCHERS = "local", "ray"
 
 
 def is_done(name: str, results: Path) -> bool:
@@ -102,14 +100,6 @@ def launch(
     return failed
 
 
-def check_launcher(launcher: str) -> None:
-    """Raise ``ValueError`` for an unknown launcher, and for ``ray`` where Ray is not installed."""
-    if launcher not in LAUNCHERS:
-        raise ValueError(f"launcher must be one of {', '.join(LAUNCHERS)}, got {launcher!r}")
-    if launcher == "ray" and find_spec("ray") is None:
-        raise ValueError("launcher ray needs Ray: pip install '.[ray]'")
-
-
 def launch_local(
     cells: Sequence[Cell], run: Callable[[Cell], str | None], workers: int = 1
 ) -> Iterator[tuple[Cell, str | None]]:
@@ -128,20 +118,8 @@ def launch_ray(
     cells: Sequence[Cell], run: Callable[[Cell], str | None], cpus: float = 2, gpus: float = 0
 ) -> Iterator[tuple[Cell, str | None]]:
     """Run cells on a Ray cluster, and yield them with their messages in the order in which they end."""
-    import ray
-
-    if not ray.is_initialized():
-        ray.init(log_to_driver=False)
-    remote = ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=0)(_call)
-    running = {remote.remote(run, cell): cell for cell in cells}
-    while running:
-        (done,), _ = ray.wait(list(running))
-        cell = running.pop(done)
+    for cell, end in run_by_ray(run, cells, cpus, gpus):
         try:
-            yield cell, ray.get(done)
-        except ray.exceptions.RayError as error:
-            yield cell, f"{cell.name} was lost by Ray ({type(error).__name__}); the same command resumes"
-
-
-def _call(run: Callable[[Cell], str | None], cell: Cell) -> str | None:
-    return run(cell)
+            yield cell, end()
+        except OSError as error:
+            yield cell, f"{cell.name}: {error}"

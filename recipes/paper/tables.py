@@ -20,8 +20,9 @@ from functools import partial
 from pathlib import Path
 
 from dynmap_rl.paper.cells import TABLES, Cell, list_cells
-from dynmap_rl.paper.launch import LAUNCHERS, check_launcher, has_run, is_done, launch, run_cell
+from dynmap_rl.paper.launch import has_run, is_done, launch, run_cell
 from dynmap_rl.utils.cli import command_line, refuse, run_recipe
+from dynmap_rl.utils.cluster import LAUNCHERS, check_launcher
 from dynmap_rl.utils.settings import check_at_least
 
 RECIPES = Path(__file__).parents[1]

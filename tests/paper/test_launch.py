@@ -9,7 +9,8 @@ from threading import Event
 import pytest
 
 from dynmap_rl.paper.cells import Cell
-from dynmap_rl.paper.launch import check_launcher, has_run, is_done, launch, run_cell
+from dynmap_rl.paper.launch import has_run, is_done, launch, run_cell
+from dynmap_rl.utils.cluster import check_launcher
 
 CELL = Cell("b", "generalize", ("--task", "bin_dropping"), needs="a")
 FOLDERS = {"recipes": Path("/recipes"), "results": Path("results"), "runs": Path("runs")}
@@ -125,4 +126,4 @@ def test_ray_reports_a_cell_whose_process_died(monkeypatch):
         messages = launch(CELLS, die_at_b, "ray", cpus=1)
     finally:
         ray.shutdown()
-    assert messages == ["b was lost by Ray (WorkerCrashedError); the same command resumes"]
+    assert messages == ["b: a worker was lost by Ray (WorkerCrashedError); the same command resumes"]
