@@ -36,6 +36,8 @@ class Config:
     expert: Path | None = None
     # Processes that roll out and write.
     workers: int = 2
+    # local, or ray: a CPU of a Ray cluster for every 25 episodes, in the place of --workers.
+    launcher: str = "local"
     # Id on the Hugging Face hub (user/name) to upload the dataset to.
     push_to_hub: str | None = None
 
@@ -53,7 +55,7 @@ def main(config: Config) -> None:
     output = config.output or Path("datasets") / f"{get_task(config.task).name}{suffix}"
     complete = (output / META).exists()
     sizes = config.episodes, config.eval_episodes
-    record_dataset(output, config.task, config.kind, *sizes, config.workers, config.expert)
+    record_dataset(output, config.task, config.kind, *sizes, config.workers, config.expert, config.launcher)
     print(f"{'already complete' if complete else 'written'}: {output}")
     folder = Path("runs/collect") / output.name
     said = f"{load_meta(output)['rejected']} further candidates failed and were left out"

@@ -29,6 +29,8 @@ class Config:
     task: str = "balance_reaching"
     # Dataset: a folder or a hub id; by default datasets/TASK, recorded where it is missing.
     dataset: str | None = None
+    # Folder for decoded datasets; by default DATASET.cache beside the dataset.
+    cache: Path | None = None
     # Run folder; by default runs/decoupled/TASK/SUPERVISION_KIND.
     run: Path | None = None
     # Seeds of the policies.
@@ -63,7 +65,9 @@ def main(config: Config) -> None:
     from dynmap_rl.training.world_model import build_world_model, train_world_model
     from dynmap_rl.utils.devices import choose_device, seed_everything
     from dynmap_rl.utils.files import read_json
+    from dynmap_rl.utils.ranks import first_rank_first, join_ranks, leave_ranks
 
+    join_ranks(config.compute.device)
     task, seeds = get_task(config.task), parse_seeds(config.seeds)
     device = choose_device(config.compute.device)
     check_logger(config.logger)
@@ -73,7 +77,7 @@ def main(config: Config) -> None:
     source = {"task": config.task, "training": "decoupled"}
     name = f"{config.world_model.supervision.replace(',', '_')}_{config.policy.kind}"
     folder = config.run or Path("runs/decoupled") / task.name / name
-    open_run(folder, config, ignore=("run", "compute", "logger"))
+    open_run(folder, config, ignore=("run", "cache", "compute", "logger"))
     if (folder / "eval.json").exists():
         result = read_json(folder / "eval.json")
         if world_model:
@@ -82,14 +86,17 @@ def main(config: Config) -> None:
         return
 
     torch.set_num_threads(config.compute.threads)
-    dataset = find_or_record(config.task, config.dataset)
-    episodes, constants = load_demonstrations(dataset)
+    with first_rank_first():
+        dataset = find_or_record(config.task, config.dataset)
+    episodes, constants = load_demonstrations(dataset, config.cache)
     if world_model is None:
         seed_everything(config.world_model.seed)
         world_model = build_world_model(constants, config.world_model, episodes["train"]).to(device)
         augmentation = choose_augmentation(task, config.world_model.augmentation)
         settings, by_entry = replace(config.world_model, augmentation=augmentation), not task.planar
         train_world_model(world_model, episodes, folder, settings, logger=config.logger, by_entry=by_entry)
+    if leave_ranks():
+        return  # policies are small: the first process trains them
     judge = partial(judge_in_closed_loop, task=config.task, settings=config.eval)
     fingerprint = train_policies(
         world_model, episodes, constants, folder, config.policy,

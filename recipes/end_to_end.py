@@ -28,6 +28,8 @@ class Config:
     task: str = "balance_reaching"
     # Dataset: a folder or a hub id; by default datasets/TASK, recorded where it is missing.
     dataset: str | None = None
+    # Folder for decoded datasets; by default DATASET.cache beside the dataset.
+    cache: Path | None = None
     # Run folder; by default runs/end_to_end/TASK/KIND.
     run: Path | None = None
     # Seeds of world models and policies.
@@ -57,32 +59,37 @@ def main(config: Config) -> None:
     from dynmap_rl.training.joint import train_seeds
     from dynmap_rl.utils.devices import choose_device
     from dynmap_rl.utils.files import read_json
+    from dynmap_rl.utils.ranks import first_rank_first, join_ranks, leave_ranks
 
+    join_ranks(config.compute.device)
     task, seeds = get_task(config.task), parse_seeds(config.seeds)
     choose_device(config.compute.device)
     check_logger(config.logger)
     if config.dataset:
         check_dataset(config.dataset, config.task)
     folder = config.run or Path("runs/end_to_end") / task.name / config.policy.kind
-    open_run(folder, config, ignore=("run", "compute", "logger"))
+    open_run(folder, config, ignore=("run", "cache", "compute", "logger"))
     if (folder / "eval.json").exists():
         result = read_json(folder / "eval.json")
         print(f"{folder} is complete; delete it to run again\n\n{row_text(result, paper_numbers(result))}")
         return
 
-    dataset = find_or_record(config.task, config.dataset)
+    with first_rank_first():
+        dataset = find_or_record(config.task, config.dataset)
     augmentation = config.training.augmentation
     if not task.symmetric:  # the policy learns from the changed windows too
         augmentation = replace(augmentation, mirror=False, max_shift=0)
     augmentation = choose_augmentation(task, augmentation)
     world_model = train_seeds(
-        partial(load_demonstrations, dataset), folder,
+        partial(load_demonstrations, dataset, config.cache), folder,
         WorldModelArchitecture("none"), config.policy, replace(config.training, augmentation=augmentation),
         judge=partial(judge_in_closed_loop, task=config.task, settings=config.eval),
         seeds=seeds, compute=config.compute, logger=config.logger,
     )  # fmt: skip
+    if leave_ranks():
+        return
     result = write_report(
-        folder, world_model, load_dataset(dataset, "eval"), seeds,
+        folder, world_model, load_dataset(dataset, "eval", config.cache), seeds,
         task=config.task, dataset=dataset, policy=config.policy.kind,
         source={"task": config.task, "training": "end_to_end"},
         settings=plain_settings(config), command=command_line(sys.argv), compare=paper_numbers,

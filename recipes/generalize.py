@@ -29,6 +29,8 @@ class Config:
     pretrained: str = "runs/decoupled/balance_reaching/position_velocity_recurrent"
     # Dataset: a folder or a hub id; by default datasets/TASK, recorded where it is missing.
     dataset: str | None = None
+    # Folder for decoded datasets; by default DATASET.cache beside the dataset.
+    cache: Path | None = None
     # Run folder; by default runs/generalize/TASK/TRAINING_SUPERVISION_KIND.
     run: Path | None = None
     # Seeds of the policies.
@@ -74,7 +76,7 @@ def main(config: Config) -> None:
         )
     name = f"{source['training']}_{'_'.join(world_model.supervision) or 'none'}_{config.policy.kind}"
     folder = config.run or Path("runs/generalize") / task.name / name
-    open_run(folder, config, ignore=("run", "compute", "logger"))
+    open_run(folder, config, ignore=("run", "cache", "compute", "logger"))
     if (folder / "eval.json").exists():
         result = read_json(folder / "eval.json")
         check_same(world_model, result, folder)
@@ -83,7 +85,7 @@ def main(config: Config) -> None:
 
     torch.set_num_threads(config.compute.threads)
     dataset = find_or_record(config.task, config.dataset)
-    episodes, constants = load_demonstrations(dataset)
+    episodes, constants = load_demonstrations(dataset, config.cache)
     judge = partial(judge_in_closed_loop, task=config.task, settings=config.eval)
     fingerprint = train_policies(
         world_model, episodes, constants, folder, config.policy,

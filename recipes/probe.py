@@ -27,6 +27,8 @@ class Config:
     runs: str = "runs/decoupled/balance_reaching/position_velocity_recurrent"
     # Dataset of balance_reaching: a folder or a hub id; by default datasets/balance_reaching, recorded if missing.
     dataset: str | None = None
+    # Folder for decoded datasets; by default DATASET.cache beside the dataset.
+    cache: Path | None = None
     # Demonstrations that the linear maps are fitted to.
     train_episodes: int = 100
     # Held-out demonstrations of all measurements.
@@ -58,8 +60,8 @@ def main(config: Config) -> None:
 
     models = load_world_models(config.runs.split(","))
     dataset = config.dataset or find_or_record("balance_reaching")
-    train = load_dataset(dataset, "train")[: config.train_episodes]
-    test = load_dataset(dataset, "eval")[: config.test_episodes]
+    train = load_dataset(dataset, "train", config.cache)[: config.train_episodes]
+    test = load_dataset(dataset, "eval", config.cache)[: config.test_episodes]
     open_loop = {
         name: open_loop_errors(model, test, config.context, config.horizon)
         for name, model in models.items()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -21,6 +22,7 @@ def imitation_loss(
     normalizer: Normalizer,
     ignore: torch.Tensor | None = None,
     emphasis: float = 0.0,
+    total: Callable[[torch.Tensor], torch.Tensor] = lambda weight: weight,
 ) -> torch.Tensor:
     """Return the mean absolute difference of two actions in normalised units, a scalar.
 
@@ -33,6 +35,7 @@ def imitation_loss(
             model's memory holds the last action, and copying it has a low loss in most steps; the weight stresses
             the steps in which the expert changes its action (keyframe-focused imitation, Wen et al. 2021). 0 is the
             paper's loss.
+        total: function of the sum of the weights, by whose result the loss is divided.
     """
     error = ((predicted - action) / normalizer.scale).abs().mean(-1, keepdim=True)
     weight = torch.ones_like(error)
@@ -41,7 +44,7 @@ def imitation_loss(
         weight = weight + emphasis * ((action - before) / normalizer.scale).abs().mean(-1, keepdim=True)
     if ignore is not None:  # not by a product, since ignored entries may be NaN
         error, weight = (torch.where(ignore, 0.0, x) for x in (error, weight))
-    return (error * weight).sum() / weight.sum().clamp_min(1)
+    return (error * weight).sum() / total(weight.sum()).clamp_min(1)
 
 
 def find_target(

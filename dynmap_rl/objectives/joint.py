@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import dispatch
 from tensordict.utils import NestedKey, unravel_key
 from torchrl.objectives.common import LossModule
 
 from dynmap_rl.modules.policy import FeedforwardPolicy, RecurrentPolicy
+from dynmap_rl.utils.ranks import mean_over_ranks
 
 from .imitation import find_target, imitation_loss
 from .world_model import WorldModelLoss
@@ -93,5 +95,7 @@ class JointLoss(LossModule):
         predicted = self.policy(latent, *states[1:], tensordict[self.tensor_keys.goal])
         keys, masks = self.tensor_keys, self.world_model_loss._loss_mask_keys()
         target, ignore = find_target(tensordict, keys.action, keys.expert_action, keys.disturbed, masks)
-        loss = imitation_loss(predicted, target, self.policy.action, ignore, self.emphasis)
+        # Divided by the same number in all processes, so that the mean of their losses is the loss of the whole batch.
+        total = mean_over_ranks if torch.is_grad_enabled() else (lambda weight: weight)
+        loss = imitation_loss(predicted, target, self.policy.action, ignore, self.emphasis, total)
         return TensorDict({**losses, "loss_policy": self.beta_joint * loss}, [])

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from importlib.util import find_spec
 from pathlib import Path
 from queue import SimpleQueue
 
+from dynmap_rl.utils.cluster import check_launcher
 from dynmap_rl.utils.files import read_json, write_json
 from dynmap_rl.utils.processes import run_script
 
 from .cells import Run
-
-LAUNCHERS = "local", "ray"
 
 
 def is_done(name: str, results: Path) -> bool:
@@ -121,14 +119,6 @@ def launch(
         else:
             print(f"done: {run.name}", flush=True)
     return failed
-
-
-def check_launcher(launcher: str) -> None:
-    """Raise ``ValueError`` for an unknown launcher, and for ``ray`` where Ray is not installed."""
-    if launcher not in LAUNCHERS:
-        raise ValueError(f"launcher must be one of {', '.join(LAUNCHERS)}, got {launcher!r}")
-    if launcher == "ray" and find_spec("ray") is None:
-        raise ValueError("launcher ray needs Ray: pip install '.[ray]'")
 
 
 def launch_local(

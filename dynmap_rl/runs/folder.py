@@ -13,12 +13,15 @@ import math
 from pathlib import Path
 
 from dynmap_rl.utils.files import lock_folder, read_json, write_bytes, write_json
+from dynmap_rl.utils.ranks import first_rank_first, rank
 
 FORMAT = 2  # of config.json; the first release had flat settings
 
 
 def open_run(folder: Path, config, *, ignore: tuple[str, ...] = ()) -> Path:
     """Create a run folder, or reopen it for the same settings, and lock it until this process ends.
+
+    Of several processes that train together, the first creates and locks it.
 
     Args:
         folder: run folder.
@@ -31,8 +34,13 @@ def open_run(folder: Path, config, *, ignore: tuple[str, ...] = ()) -> Path:
     Raises:
         ValueError: the folder holds a run with other settings or of another release, or is in use.
     """
-    folder = Path(folder)
-    lock_folder(folder)
+    with first_rank_first():
+        return _open(Path(folder), config, ignore)
+
+
+def _open(folder: Path, config, ignore: tuple[str, ...]) -> Path:
+    if not rank():
+        lock_folder(folder)
     settings = {"format": FORMAT, **plain_settings(config)}
     path = folder / "config.json"
     if not path.exists():

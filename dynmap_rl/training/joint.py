@@ -18,6 +18,7 @@ from dynmap_rl.objectives.world_model import WorldModelLoss
 from dynmap_rl.utils.devices import Compute, choose_device, seed_everything
 from dynmap_rl.utils.files import write_json
 from dynmap_rl.utils.processes import run_processes
+from dynmap_rl.utils.ranks import rank, ranks
 from dynmap_rl.utils.weights import fingerprint
 
 from .decoupled import Judge
@@ -138,7 +139,7 @@ def train_seeds(
     compute: Compute | None = None,
     logger: str | None = None,
     by_entry: bool = False,
-) -> WorldModel:
+) -> WorldModel | None:
     """Train and judge a world model with its policy for every seed that ``folder`` does not hold yet.
 
     Args:
@@ -156,7 +157,7 @@ def train_seeds(
         by_entry: see :func:`dynmap_rl.training.train_world_model`.
 
     Returns:
-        The first seed's world model.
+        The first seed's world model; None in all but the first of several processes that train together.
 
     Raises:
         OSError: a process died.
@@ -164,7 +165,11 @@ def train_seeds(
     compute, folder = compute or Compute(), Path(folder)
     todo = [seed for seed in seeds if not (folder / f"seed_{seed}" / "eval.json").exists()]
     work = _Work(load, folder, world_model, policy, settings, judge, compute.device, logger, by_entry)
-    run_processes([_train_and_evaluate], [(work, seed) for seed in todo], compute.threads)
+    # Processes that train together train one seed after the other.
+    workers = compute.threads if ranks() == 1 else 1
+    run_processes([_train_and_evaluate], [(work, seed) for seed in todo], workers)
+    if rank():
+        return None
     first = load_world_model(folder / f"seed_{seeds[0]}" / "world_model")
     save_world_model(folder / "world_model", first)
     return first
@@ -185,6 +190,8 @@ def _train_and_evaluate(arguments: tuple[_Work, int]) -> None:
         train_jointly(world_model, policy, episodes, folder, work.settings, **common)
     else:
         train_end_to_end(world_model, policy, episodes, folder, work.settings, **common)
+    if rank():
+        return
     world_model.eval(), policy.eval()
     save_world_model(folder / "world_model", world_model)
     save_policy(folder / "policy", policy, world_model)

@@ -17,6 +17,7 @@ from dynmap_rl.data.windows import sample_windows
 from dynmap_rl.modules.precision import mixed_precision
 from dynmap_rl.runs.folder import load_training_state, save_training_state, truncate_metrics
 from dynmap_rl.runs.loggers import log_metrics
+from dynmap_rl.utils.ranks import mean_over_ranks, rank, ranks, translate_errors
 
 from .settings import EndToEndTraining, WorldModelTraining, windows_at
 
@@ -24,6 +25,7 @@ ADVICE = "the last saved state is kept; run again with a lower learning rate, in
 SAVE_EVERY = 250  # updates
 
 
+@translate_errors()
 def fit(
     model: nn.Module,
     make_loss: Callable[[torch.Generator], nn.Module],
@@ -37,6 +39,9 @@ def fit(
 ) -> None:
     """Minimise a loss on random windows of episodes; a stopped run resumes from its last training state.
 
+    Under ``torchrun``, every process trains on its part of each batch, and the first one writes. A run may resume with
+    another number of processes.
+
     Args:
         model: all that is trained, changed in place.
         make_loss: function that makes the loss module from the generator of its random numbers.
@@ -49,7 +54,9 @@ def fit(
         save_every: updates between training states.
 
     Raises:
-        ValueError: the loss is not finite or diverges; the last training state is kept.
+        ValueError: the loss is not finite or diverges, or a batch cannot be divided among the processes; the last
+            training state is kept.
+        OSError: another process has ended.
     """
     folder = Path(folder)
     device = next(model.parameters()).device
@@ -57,31 +64,44 @@ def fit(
     optimizer = make_optimizer(model, settings.learning_rate, weight_decay=1e-4)
     episodes = episodes.select(
         "pixels", "action", "goal", "dynamics", "disturbed", "expert_action", strict=False
-    ).to(device)
+    )
+    if device.type == "cuda" and episodes.bytes() < torch.cuda.mem_get_info(device)[0] / 2:
+        episodes = episodes.to(device)  # larger ones stay on disk
     generator = torch.Generator(device).manual_seed(1000 * seed)
-    loss_module = make_loss(generator)
+    # What a rank draws beside the windows of the whole batch, by which all stay in step.
+    own = generator if ranks() == 1 else torch.Generator(device)
+    loss_module = make_loss(own)
     start, first, path = 0, None, folder / "checkpoint" / "world_model.pt"
     if state := load_training_state(path):
         model.load_state_dict(state["model"])
         optimizer.load_state_dict(state["optimizer"])
         start, first = state["update"], state["first_loss"]
         _restore(generator, state["generator"], start)
-    truncate_metrics(folder, start)
-    progress = tqdm(range(start, settings.updates), folder.name, settings.updates, initial=start)
+    if not rank():
+        truncate_metrics(folder, start)
+    loss_module = share_gradients(loss_module, some=type(settings) is EndToEndTraining)
+    part = slice(rank(), None, ranks())
+    bar = {"initial": start, "disable": rank() > 0}
+    progress = tqdm(range(start, settings.updates), folder.name, settings.updates, **bar)
     for update in progress:
         set_learning_rate(optimizer, settings.learning_rate, update, settings.updates)
-        windows = sample_windows(episodes, *windows_at(settings, update), generator)
-        windows = change_windows(windows, settings.augmentation, generator)
+        batch, length = windows_at(settings, update)
+        if batch % ranks():
+            raise ValueError(f"windows of a batch must be a multiple of {ranks()} processes, got {batch}")
+        windows = sample_windows(episodes, batch, length, generator, part).to(device)
+        if own is not generator:
+            own.manual_seed((1000 * seed + update) * ranks() + rank())
+        windows = change_windows(windows, settings.augmentation, own)
         with mixed_precision(device):
             losses = loss_module(windows)
         norm = step(sum(losses.values()), optimizer)
         done = update + 1
         saved = done % save_every == 0 or done == settings.updates
         if saved or done % 50 == 0 or done == 1:
-            losses = {name: value.item() for name, value in losses.items()}
+            losses = {name: mean_over_ranks(value).item() for name, value in losses.items()}
             first = check_loss(sum(losses.values()), norm, first)
             progress.set_postfix({k.removeprefix("loss_"): f"{v:.3f}" for k, v in losses.items()})
-        if saved:
+        if saved and not rank():
             log_metrics(folder, done, logger, **losses, **held_out())
             save_training_state(
                 path,
@@ -91,6 +111,31 @@ def fit(
                 update=done,
                 first_loss=first,
             )
+
+
+class _Losses(nn.Module):
+    """Loss module with a dict for its result, in which DistributedDataParallel finds the tensors."""
+
+    def __init__(self, module: nn.Module):
+        super().__init__()
+        self.module = module
+
+    def forward(self, windows: TensorDictBase) -> dict[str, torch.Tensor]:
+        return dict(self.module(windows).items())
+
+
+def share_gradients(loss_module: nn.Module, some: bool = False) -> nn.Module:
+    """Return a loss module whose gradients are means over all processes.
+
+    Args:
+        loss_module: loss of the process's own windows.
+        some: whether some parameters have no influence on the loss.
+    """
+    if ranks() == 1:
+        return loss_module
+    return nn.parallel.DistributedDataParallel(
+        _Losses(loss_module), broadcast_buffers=False, find_unused_parameters=some
+    )
 
 
 def change_windows(

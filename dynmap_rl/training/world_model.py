@@ -12,6 +12,7 @@ from dynmap_rl.modules.checkpoints import make_world_model
 from dynmap_rl.modules.supervision import parse_supervision
 from dynmap_rl.modules.world_model import WorldModel
 from dynmap_rl.objectives.world_model import WorldModelLoss
+from dynmap_rl.utils.ranks import ranks
 
 from .loop import SAVE_EVERY, fit
 from .settings import JointTraining, WorldModelArchitecture, WorldModelTraining
@@ -75,8 +76,9 @@ def train_world_model(
 def make_loss(
     world_model: WorldModel, settings: WorldModelTraining | JointTraining, generator: torch.Generator
 ) -> WorldModelLoss:
-    """Make the world model's loss module, whose decoded frames ``generator`` draws."""
+    """Make the world model's loss module, whose decoded frames ``generator`` draws; processes share them."""
     weights = {"beta_z": settings.beta_z, "beta_dynamics": settings.beta_dynamics, "rarity": settings.rarity}
     if isinstance(settings, WorldModelTraining):
         weights["imagined"] = settings.imagined
-    return WorldModelLoss(world_model, **weights, rgb_frames=settings.rgb_frames, generator=generator)
+    frames = max(1, settings.rgb_frames // ranks())
+    return WorldModelLoss(world_model, **weights, rgb_frames=frames, generator=generator)

@@ -21,8 +21,9 @@ from functools import partial
 from pathlib import Path
 
 from dynmap_rl.paper.cells import TABLES, UNDISTURBED, Run, list_runs
-from dynmap_rl.paper.launch import LAUNCHERS, check_launcher, execute, has_run, is_done, launch
+from dynmap_rl.paper.launch import execute, has_run, is_done, launch
 from dynmap_rl.utils.cli import command_line, refuse, run_recipe
+from dynmap_rl.utils.cluster import LAUNCHERS, check_launcher
 from dynmap_rl.utils.settings import check_at_least
 
 RECIPES = Path(__file__).parents[1]

@@ -2,9 +2,12 @@
 
     uv run --extra onnx python tests/benchmarks/realtime.py            # 10,000 steps each, 8 minutes each
     uv run --extra onnx python tests/benchmarks/realtime.py --fast     # the same without sleeping between steps
+    uv run --extra lerobot python tests/benchmarks/realtime.py --fast --only act,diffusion \
+        --lerobot act=runs/act/checkpoints/last/pretrained_model,diffusion=runs/diffusion/checkpoints/last/pretrained_model
 
 Latency is the time from a frame to its action. ``actor`` acts on present frames; ``delayed`` on frames that are six steps
-old; ``onnx`` is ``actor`` in onnxruntime. ``server`` is a policy in a process of its own, which works on every frame for
+old; ``onnx`` is ``actor`` in onnxruntime. ``--lerobot`` names policies of LeRobot, whose latency is largest in the steps in
+which they predict a chunk. ``server`` is a policy in a process of its own, which works on every frame for
 about ``--work`` seconds of its processor (it encodes the frame again and again), and answers with a chunk; the loop goes
 on meanwhile, and its latency is the time to look up the action. It cannot be ``--fast``, as a frame would then be older
 in steps. Loop and server share one core. Writes ``recipes/results/measurements/realtime.json``.
@@ -19,6 +22,7 @@ import platform
 import sys
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
@@ -46,14 +50,21 @@ class Local:
 
     def reset(self) -> None:
         self.memory, self.frames = TensorDict({}, [1]), []
+        if hasattr(self.actor, "reset"):  # a policy of LeRobot keeps its memory itself
+            self.actor.reset()
 
     @torch.no_grad()
-    def act(self, frame: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    def act(self, frame: np.ndarray, agent_pos: np.ndarray) -> np.ndarray:
         self.frames.append(torch.from_numpy(frame).movedim(-1, 0)[None])
         self.frames = self.frames[-self.delay - 1 :]
-        td = self.memory.set("pixels", self.frames[0]).set("goal", torch.from_numpy(goal)[None])
+        agent_pos = torch.from_numpy(agent_pos)[None]
+        td = (
+            self.memory.set("pixels", self.frames[0])
+            .set("agent_pos", agent_pos)
+            .set("goal", agent_pos[:, 3:])
+        )
         td = self.actor(td)
-        self.memory = td["next"]
+        self.memory = td.get("next", TensorDict({}, [1]))
         return td["action"][0].numpy()
 
 
@@ -66,8 +77,14 @@ class Onnx:
         self.actor = OnnxActor(export_to_onnx("balance_reaching", folder))
         self.reset = self.actor.reset
 
-    def act(self, frame: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        return self.actor.act(frame.transpose(2, 0, 1)[None], goal[None])[0]
+    def act(self, frame: np.ndarray, agent_pos: np.ndarray) -> np.ndarray:
+        return self.actor.act(frame.transpose(2, 0, 1)[None], agent_pos[None, 3:])[0]
+
+
+def load_lerobot(path: str) -> Local:
+    from dynmap_rl.integrations.lerobot import LeRobotActor
+
+    return Local(LeRobotActor(path))
 
 
 def answer(pipe, delay: int, size: int, work: float) -> None:
@@ -103,11 +120,11 @@ class Server:
             self.pipe.recv()  # of the episode before
         self.step, self.plan, self.busy = 0, {}, False
 
-    def act(self, frame: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    def act(self, frame: np.ndarray, agent_pos: np.ndarray) -> np.ndarray:
         if self.busy and (self.step == 0 or self.pipe.poll()):
             self._receive()
         if not self.busy:
-            self.pipe.send((frame, goal, self.step))
+            self.pipe.send((frame, agent_pos[3:], self.step))
             self.busy = True
             if self.step == 0:  # a robot waits for its first action
                 self._receive()
@@ -141,7 +158,7 @@ def measure(controller, steps: int, paced: bool) -> dict:
             controller.reset()
             scene, first, due = scene + 1, True, time.perf_counter()
         began = time.perf_counter()
-        action = controller.act(observation["pixels"], observation["agent_pos"][3:])
+        action = controller.act(observation["pixels"], observation["agent_pos"])
         if not (first and isinstance(controller, Server)):
             latencies.append(1000 * (time.perf_counter() - began))
         observation, _, terminated, truncated, info = env.step(action)
@@ -170,6 +187,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--steps", type=int, default=10_000)
     parser.add_argument("--fast", action="store_true", help="no sleep between steps")
+    parser.add_argument("--lerobot", default="", help="policies of LeRobot: NAME=FOLDER with commas between")
     parser.add_argument("--only", default="actor,delayed,onnx,server")
     parser.add_argument(
         "--work", type=float, default=0.2, help="processor time of the server for a frame (s)"
@@ -187,6 +205,8 @@ def main() -> None:
             "onnx": lambda: Onnx(Path(folder)),
             "server": lambda: Server(delay=10, size=30, work=options.work),
         }
+        for name, path in (policy.split("=") for policy in filter(None, options.lerobot.split(","))):
+            controllers[name] = partial(load_lerobot, path)
         for name in options.only.split(","):
             controller = controllers[name]()
             row = measure(controller, options.steps, paced=not options.fast or name == "server")

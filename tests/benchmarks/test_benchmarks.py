@@ -17,6 +17,7 @@ from dynmap_rl.keys import DYNAMICS
 from dynmap_rl.modules.checkpoints import make_world_model
 from dynmap_rl.objectives.world_model import WorldModelLoss
 from dynmap_rl.utils.cli import parse_settings, read_arguments
+from dynmap_rl.utils.files import write_json
 
 SMALL = {
     "control_step": {},
@@ -111,12 +112,52 @@ def test_the_page_holds_the_stored_numbers(load):
     assert run.page(text.replace("**", "")) == text
 
 
+def test_the_plan_follows_from_the_stored_numbers(load, tmp_path):
+    planning = load("planning")
+    text = planning.PAGE.read_text()
+    assert planning.page(text) == text, "python tests/benchmarks/planning.py"
+    size = {
+        "episodes": 100,
+        "files_MB": 3,
+        "cache_MB": 150,
+        "cold": {"load_s": 2},
+        "warm": {"private_MB": 400},
+    }
+    write_json(tmp_path / "dataset_size.json", {"rows": {"100": size}})
+    write_json(tmp_path / "updates_cpu.json", {"device": "here", "rows": [{"frames_per_s": 1000}]})
+    needs = " ".join(planning.list_needs(tmp_path, 1_000_000).values())
+    assert [word in needs for word in ("30 GB", "1,500 GB", "5.6 hours", "33 hours")] == [True] * 4
+
+
 def test_commands_of_other_scripts_are_understood(load):
     """The commands run for hours; here only their options are parsed."""
     listed = [(name, arguments.split()) for name, arguments in kills.COMMANDS.items()]
     for recipe, arguments in [*load("memory").COMMANDS.items(), *listed]:
         config_class = importlib.import_module(f"recipes.{recipe.replace('/', '.')}").Config
         parse_settings(config_class, read_arguments(arguments, config_class))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("enlarge", [False, True])
+def test_datasets_are_tiled(load, recording, tmp_path, enlarge):
+    size = load("dataset_size")
+    root = tmp_path / "tiled"
+    size.tile(recording, root, 9, enlarge)
+    source, tiled = load_dataset(recording), load_dataset(root)
+    assert torch.equal(tiled["action"], torch.cat([source["action"], source["action"][:3]]))
+    cameras = [tiled["pixels"]] if not enlarge else tiled["pixels"][..., ::2, ::2].split(64, -1)
+    assert all(torch.equal(frames[6:], source["pixels"][:3]) for frames in cameras)
+    row = size.measure(root, in_memory=True)
+    assert all(value > 0 for value in row.values())
+
+
+@pytest.mark.slow
+def test_updates_are_measured(load):
+    updates, cpu = load("updates"), torch.device("cpu")
+    peak = updates.convolution_peak(cpu, mixed=False, repeats=1)
+    row = updates.measure(cpu, 2, mixed=False, compiled=False, repeats=1, peak=peak)
+    assert 0 < row["share_of_convolution_peak"] < 1 and row["frames_per_s"] > 0
+    assert sum(row["breakdown"].values()) == pytest.approx(1) and row["breakdown"]["convolution"] > 0
 
 
 @pytest.mark.slow

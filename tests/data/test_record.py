@@ -79,9 +79,23 @@ def is_running(pid: int) -> bool:
 
 def test_a_complete_recording_is_left_as_it_is(recording):
     before = {p: p.stat().st_mtime_ns for p in recording.rglob("*")}
+    beside = sorted(recording.parent.iterdir())
     assert record_dataset(recording, episodes=4, eval_episodes=2) == recording
     assert {p: p.stat().st_mtime_ns for p in recording.rglob("*")} == before
-    assert [p.name for p in recording.parent.iterdir()] == [recording.name]
+    assert sorted(recording.parent.iterdir()) == beside
+
+
+@pytest.mark.slow
+def test_ray_records_the_same_bits(recording, tmp_path, monkeypatch):
+    ray = pytest.importorskip("ray")
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    monkeypatch.setattr(module, "SHARD_EPISODES", 2)
+    try:
+        root = record_dataset(tmp_path / "recording", episodes=4, eval_episodes=2, launcher="ray")
+    finally:
+        ray.shutdown()
+    assert files(root) == files(recording)
 
 
 def test_a_recording_of_the_first_release_is_refused(recording, tmp_path):

@@ -10,7 +10,8 @@ from threading import Event
 import pytest
 
 from dynmap_rl.paper.cells import Run
-from dynmap_rl.paper.launch import check_launcher, execute, has_run, is_done, launch
+from dynmap_rl.paper.launch import execute, has_run, is_done, launch
+from dynmap_rl.utils.cluster import check_launcher
 
 CELL = "bin_dropping", "joint", "recurrent", "Only-RGB"
 RUN = Run("b", "generalize", CELL, ("--task", "bin_dropping"), needs="a")

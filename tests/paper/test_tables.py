@@ -67,7 +67,7 @@ def test_ablations_are_compared_with_the_default(tmp_path):
     text = markdown_own(read_cells(tmp_path, ["ablations"]), "ablations")
     assert line_of(text, "default").endswith("|  |")
     assert " | -50.0 [" in line_of(text, "no imagined steps")
-    assert line_of(text, "no distractors").endswith("- | - |")
+    assert line_of(text, "no mirrored windows").endswith("- | - |")
 
 
 def test_plain_world_models_stand_beside_the_default(tmp_path):

@@ -79,7 +79,7 @@ def test_the_readme_is_short():
 
 def test_every_command_is_looked_at():
     names = {next(w for w in words if not re.match(r"[A-Z_]+=", w)) for _, words in commands()}
-    other = {"python", "uv", "pip", "hf", "git", "cd", "source"}
+    other = {"python", "torchrun", "uv", "pip", "hf", "git", "cd", "source"}
     assert not {name for name in names - other if not name.startswith("lerobot-")}
 
 

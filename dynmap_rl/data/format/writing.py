@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import io
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 from tensordict import TensorDict
 
 from dynmap_rl.envs.protocol import Layout
@@ -60,14 +62,7 @@ def write_episodes(folder: Path, episodes: TensorDict, instruction: str, layout:
             LOCAL_ID, layout.fps, features, root=folder, robot_type=layout.robot, use_videos=False
         )
         for episode in range(len(columns["action"])):
-            for t in range(episodes.shape[1]):
-                frame = {name: values[episode, t] for name, values in columns.items()}
-                dataset.add_frame({**frame, "task": instruction})
-            # LeRobot computes statistics in the buffer's precision, and float32 is not enough for variances.
-            buffer = dataset.writer.episode_buffer
-            for name in columns:
-                if features[name]["dtype"] == "float32":
-                    buffer[name] = [value.astype(np.float64) for value in buffer[name]]
+            _fill_buffer(dataset, {name: values[episode] for name, values in columns.items()}, instruction)
             with _without_cache():
                 dataset.save_episode()
         dataset.finalize()
@@ -76,6 +71,33 @@ def write_episodes(folder: Path, episodes: TensorDict, instruction: str, layout:
     for key in ("pixels", "agent_pos", "action", "dynamics", "disturbed", "expert_action"):
         if not (written[key] == episodes[key]).all():
             raise OSError(f"{key} of {folder} must be as written, got other values; check the disk")
+
+
+class _Images(list):
+    """Image files of an episode, with their ``pixels`` uint8 ``[T, 3, H, W]``."""
+
+    def __init__(self, frames: np.ndarray):
+        from lerobot.datasets.utils import IMAGE_FILE_PATTERN
+
+        super().__init__()
+        self.pixels = frames.transpose(0, 3, 1, 2)
+        for t, frame in enumerate(frames):
+            file = io.BytesIO()
+            Image.fromarray(frame).save(file, "PNG", compress_level=6)  # as LeRobot does
+            self.append({"bytes": file.getvalue(), "path": IMAGE_FILE_PATTERN.format(frame_index=t)})
+
+
+def _fill_buffer(dataset, columns: dict[str, np.ndarray], instruction: str) -> None:
+    """Give LeRobot a whole episode: its ``add_frame`` checks every value and writes every image to a file."""
+    steps = len(columns["action"])
+    buffer = dataset.writer.episode_buffer
+    buffer |= {"size": steps, "task": [instruction] * steps, "frame_index": np.arange(steps)}
+    buffer["timestamp"] = np.arange(steps) / dataset.fps
+    for name, values in columns.items():
+        if values.dtype == np.uint8:
+            buffer[name] = _Images(values)
+        else:  # LeRobot computes statistics in the buffer's precision, and float32 is not enough for variances
+            buffer[name] = values.astype(np.float64) if values.dtype == np.float32 else values
 
 
 def merge_datasets(
@@ -145,18 +167,23 @@ def _compute_stats(root: Path, layout: Layout) -> dict[str, dict[str, np.ndarray
 def _without_cache():
     """Embed the images of an episode at once, and without the hashes that ``datasets`` takes of it for its cache.
 
-    LeRobot embeds row by row.
+    LeRobot embeds row by row, and reads image files for their statistics.
     """
     from datasets import Dataset, arrow_dataset
     from datasets.fingerprint import generate_random_fingerprint
     from datasets.table import embed_table_storage
-    from lerobot.datasets import dataset_writer, io_utils
+    from lerobot.datasets import compute_stats, dataset_writer, io_utils
 
     def embed_images(dataset):
         table = embed_table_storage(dataset.data.table)
         return Dataset(table, info=dataset.info, split=dataset.split)
 
+    def sample_images(files: _Images) -> np.ndarray:
+        chosen = files.pixels[compute_stats.sample_indices(len(files))]
+        return np.stack([compute_stats.auto_downsample_height_width(frame) for frame in chosen])
+
     with (
+        _replaced(compute_stats, "sample_images", sample_images),
         _replaced(arrow_dataset, "generate_fingerprint", lambda dataset: generate_random_fingerprint()),
         _replaced(io_utils, "embed_images", embed_images),
         _replaced(dataset_writer, "embed_images", embed_images),

@@ -16,6 +16,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from dynmap_rl.envs.tasks import get_task
+from dynmap_rl.utils.cluster import check_launcher, run_by_ray
 from dynmap_rl.utils.files import read_json, write_json
 from dynmap_rl.utils.processes import start_worker
 
@@ -35,6 +36,7 @@ def record_dataset(
     eval_episodes: int = 50,
     workers: int = 2,
     expert: str | Path | None = None,
+    launcher: str = "local",
 ) -> Path:
     """Record training and held-out episodes, or resume an interrupted recording.
 
@@ -48,6 +50,7 @@ def record_dataset(
         workers: number of processes; 1 records in this process. A script that uses more must have the guard
             ``if __name__ == "__main__"``.
         expert: folder of the expert's checkpoints; by default the expert that ships for the task.
+        launcher: ``local``, or ``ray`` for one CPU of a Ray cluster a shard; the folder must be shared by its machines.
 
     Returns:
         The folder of the dataset.
@@ -59,6 +62,7 @@ def record_dataset(
     """
     from filelock import FileLock, Timeout
 
+    check_launcher(launcher)
     root = Path(root).expanduser()
     settings = {"task": task, "kind": kind, "episodes": episodes, "eval_episodes": eval_episodes}
     settings |= {"expert": str(expert or task), "format": FORMAT}
@@ -70,7 +74,7 @@ def record_dataset(
         parts.mkdir(parents=True, exist_ok=True)
         with FileLock(parts / ".lock", timeout=0):
             if not (root / META).exists():
-                _record(root, parts, settings, workers)
+                _record(root, parts, settings, workers, launcher)
             shutil.rmtree(parts)
     except Timeout as error:
         raise ValueError(
@@ -120,15 +124,15 @@ def _stored_settings(root: Path) -> dict | None:
     return read_json(path) if path.exists() else None
 
 
-def _record(root: Path, parts: Path, settings: dict, workers: int) -> None:
+def _record(root: Path, parts: Path, settings: dict, workers: int, launcher: str) -> None:
     write_json(parts / "settings.json", settings)
     for leftover in parts.glob("*.tmp"):
         shutil.rmtree(leftover)
-    shards = _plan_shards(parts, settings)
+    shards = _plan_shards(parts.absolute(), settings)  # a worker of Ray may run in another folder
     todo = [shard for shard in shards if not shard.folder.exists()]
     total, left = (sum(shard.count for shard in s) for s in (shards, todo))
     with tqdm(total=total, initial=total - left, unit="episode", desc=f"recording {root.name}") as progress:
-        for shard in _run_shards(todo, workers):
+        for shard in _run_shards(todo, workers, launcher):
             progress.update(shard.count)
     merged = parts / "merged.tmp"
     merge_shards(shards, merged, settings)
@@ -151,8 +155,13 @@ def _plan_shards(parts: Path, settings: dict) -> list[Shard]:
     ]
 
 
-def _run_shards(shards: list[Shard], workers: int) -> Iterator[Shard]:
+def _run_shards(shards: list[Shard], workers: int, launcher: str) -> Iterator[Shard]:
     """Record shards and yield each when it is complete."""
+    if launcher == "ray":
+        for shard, end in run_by_ray(record_shard, shards):
+            end()
+            yield shard
+        return
     workers = min(workers, len(shards))
     if workers <= 1:
         for shard in shards:

@@ -1,0 +1,65 @@
+"""Calls on the machines of a Ray cluster."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from importlib.util import find_spec
+
+LAUNCHERS = "local", "ray"
+
+
+def check_launcher(launcher: str) -> None:
+    """Raise ``ValueError`` for an unknown launcher, and for ``ray`` where Ray is not installed."""
+    if launcher not in LAUNCHERS:
+        raise ValueError(f"launcher must be one of {', '.join(LAUNCHERS)}, got {launcher!r}")
+    if launcher == "ray" and find_spec("ray") is None:
+        raise ValueError("launcher ray needs Ray: pip install '.[ray]'")
+
+
+def run_by_ray(
+    function: Callable, arguments: Sequence, cpus: float = 1, gpus: float = 0
+) -> Iterator[tuple[object, Callable]]:
+    """Call a function on Ray's workers, in the order in which they end.
+
+    Without a cluster, Ray starts one on this machine. Folders of the arguments must be shared by its machines.
+
+    Args:
+        function: function of one argument.
+        arguments: what the function is called with.
+        cpus: CPUs of a call.
+        gpus: GPUs of a call.
+
+    Yields:
+        The argument, and a function that returns the value, or raises what the call raised or ``OSError`` where its
+        worker died.
+    """
+    import ray
+
+    if not ray.is_initialized():
+        ray.init(log_to_driver=False)
+    remote = ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=0)(_call)
+    running = {remote.remote(function, one): one for one in arguments}
+    try:
+        while running:
+            (done,), _ = ray.wait(list(running))
+            yield running.pop(done), lambda done=done: _get(done)
+    finally:
+        for other in running:
+            ray.cancel(other)
+
+
+def _get(reference):
+    import ray
+
+    try:
+        return ray.get(reference)
+    except ray.exceptions.RayTaskError as error:
+        raise error.cause from error
+    except ray.exceptions.RayError as error:
+        raise OSError(
+            f"a worker was lost by Ray ({type(error).__name__}); the same command resumes"
+        ) from error
+
+
+def _call(function: Callable, argument):
+    return function(argument)

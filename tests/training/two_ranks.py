@@ -1,0 +1,69 @@
+"""Train small models in each of three ways, in one process or under ``torchrun``.
+
+    torchrun --nproc_per_node 2 two_ranks.py FOLDER [UPDATE]
+
+With UPDATE, the last process dies there, in the training of the world model.
+"""
+
+import os
+import signal
+import sys
+from pathlib import Path
+
+import torch
+from small import CONSTANTS, make_episodes, make_model
+
+from dynmap_rl.data.settings import Augmentation
+from dynmap_rl.modules.checkpoints import make_policy
+from dynmap_rl.training import loop
+from dynmap_rl.training.joint import train_end_to_end, train_jointly
+from dynmap_rl.training.settings import EndToEndTraining, JointTraining, WorldModelTraining
+from dynmap_rl.training.world_model import train_world_model
+from dynmap_rl.utils.ranks import join_ranks, leave_ranks, rank, ranks
+
+SIZES = {"updates": 20, "windows": 4, "window_steps": 5, "augmentation": Augmentation.off()}
+ALL = {"rgb_frames": 1000}  # no frames are drawn at random
+WORLD_MODEL = WorldModelTraining("position", imagined=0, short_windows=0, **ALL, **SIZES)
+
+
+def die_at(update: int) -> None:
+    step, calls = loop.step, []
+
+    def step_or_die(*arguments):
+        calls.append(1)
+        if len(calls) == update and rank() == ranks() - 1:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return step(*arguments)
+
+    loop.step = step_or_die
+
+
+def train(folder: Path) -> None:
+    episodes = make_episodes(5)
+    train_world_model(make_model(), episodes, folder / "world_model", WORLD_MODEL, save_every=1)
+    joint, end_to_end = JointTraining(**ALL, **SIZES), EndToEndTraining(**SIZES)
+    for name, run, settings in (
+        ("joint", train_jointly, joint),
+        ("end_to_end", train_end_to_end, end_to_end),
+    ):
+        model = make_model()
+        policy = make_policy(CONSTANTS, "recurrent", model, width=16)
+        run(model, policy, episodes, folder / name, settings, save_every=1)
+
+
+def main(folder: Path, update: int = 0) -> None:
+    torch.set_num_threads(1)
+    # Gradients in bfloat16 are rounded, and those of halves of a batch otherwise than those of the whole.
+    loop.mixed_precision = lambda device: torch.autocast("cpu", enabled=False)
+    join_ranks("cpu")
+    if update:
+        die_at(update)
+    try:
+        train(folder)
+    except OSError as error:
+        sys.exit(f"error: {error}")
+    leave_ranks()
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), *map(int, sys.argv[2:]))
