@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from pathlib import Path
 
+import cv2
 import numpy as np
 from tensordict import TensorDict
 
@@ -13,7 +15,7 @@ from dynmap_rl.keys import CAMERAS
 
 from ..demonstrations import load_dataset
 from .quiet import quiet
-from .reading import read_column, read_info, read_table
+from .reading import decode_image, read_column, read_info, read_table
 
 LOCAL_ID = "dynmap_rl/recording"  # LeRobot needs an id; it is not stored
 
@@ -59,23 +61,49 @@ def write_episodes(folder: Path, episodes: TensorDict, instruction: str, layout:
         dataset = LeRobotDataset.create(
             LOCAL_ID, layout.fps, features, root=folder, robot_type=layout.robot, use_videos=False
         )
-        for episode in range(len(columns["action"])):
-            for t in range(episodes.shape[1]):
-                frame = {name: values[episode, t] for name, values in columns.items()}
-                dataset.add_frame({**frame, "task": instruction})
-            # LeRobot computes statistics in the buffer's precision, and float32 is not enough for variances.
-            buffer = dataset.writer.episode_buffer
-            for name in columns:
-                if features[name]["dtype"] == "float32":
-                    buffer[name] = [value.astype(np.float64) for value in buffer[name]]
-            with _without_cache():
-                dataset.save_episode()
+        with _without_cache(), _images_in_memory():
+            for episode in range(len(columns["action"])):
+                of_episode = {name: values[episode] for name, values in columns.items()}
+                dataset.save_episode(_make_buffer(of_episode, episode, features, instruction, layout.fps))
         dataset.finalize()
     written = load_dataset(folder, layout=layout)
     # LeRobot only logs a frame that could not be written.
     for key in ("pixels", "agent_pos", "action", "dynamics", "disturbed", "expert_action"):
         if not (written[key] == episodes[key]).all():
             raise OSError(f"{key} of {folder} must be as written, got other values; check the disk")
+
+
+def _make_buffer(
+    columns: dict[str, np.ndarray], number: int, features: dict, instruction: str, fps: int
+) -> dict:
+    """Return an episode as LeRobot's buffer holds it, with image files in memory, several times as fast as by frames."""
+    steps = len(columns["action"])
+    buffer = {
+        "size": steps,
+        "task": [instruction] * steps,
+        "episode_index": number,
+        "frame_index": np.arange(steps),
+        "timestamp": np.arange(steps) / fps,
+        "index": [],  # LeRobot fills these
+        "task_index": [],
+    }
+    for name, values in columns.items():
+        if features[name]["dtype"] == "image":
+            buffer[name] = [
+                {"bytes": _encode(frame), "path": f"frame-{t:06d}.png"} for t, frame in enumerate(values)
+            ]
+        else:
+            # LeRobot computes statistics in the buffer's precision, and float32 is not enough for variances.
+            buffer[name] = values.astype(np.float64) if values.dtype == np.float32 else values
+    return buffer
+
+
+def _encode(frame: np.ndarray) -> bytes:
+    """Return a PNG file of a frame ``[height, width, 3]`` (RGB)."""
+    done, file = cv2.imencode(".png", cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+    if not done:
+        raise OSError("a frame could not be encoded")
+    return file.tobytes()
 
 
 def merge_datasets(
@@ -142,6 +170,23 @@ def _compute_stats(root: Path, layout: Layout) -> dict[str, dict[str, np.ndarray
 
 
 @contextlib.contextmanager
+def _images_in_memory():
+    """Let LeRobot take image files from an episode's buffer in the place of paths of files."""
+    from lerobot.datasets import compute_stats, dataset_writer
+
+    def sample_images(files: list[dict]) -> np.ndarray:
+        some = [files[i]["bytes"] for i in compute_stats.sample_indices(len(files))]
+        frames = [decode_image(file, math.inf).transpose(2, 0, 1) for file in some]
+        return np.stack([compute_stats.auto_downsample_height_width(frame) for frame in frames])
+
+    with (
+        _replaced(compute_stats, "sample_images", sample_images),
+        _replaced(dataset_writer, "embed_images", lambda dataset: dataset),
+    ):
+        yield
+
+
+@contextlib.contextmanager
 def _without_cache():
     """Embed the images of an episode at once, and without the hashes that ``datasets`` takes of it for its cache.
 
@@ -150,7 +195,7 @@ def _without_cache():
     from datasets import Dataset, arrow_dataset
     from datasets.fingerprint import generate_random_fingerprint
     from datasets.table import embed_table_storage
-    from lerobot.datasets import dataset_writer, io_utils
+    from lerobot.datasets import io_utils
 
     def embed_images(dataset):
         table = embed_table_storage(dataset.data.table)
@@ -159,7 +204,6 @@ def _without_cache():
     with (
         _replaced(arrow_dataset, "generate_fingerprint", lambda dataset: generate_random_fingerprint()),
         _replaced(io_utils, "embed_images", embed_images),
-        _replaced(dataset_writer, "embed_images", embed_images),
     ):
         yield
 
