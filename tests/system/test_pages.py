@@ -11,6 +11,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from own_task import check_renderer
 
 from dynmap_rl.runs.lookup import SHIPPED
 from dynmap_rl.utils.cli import parse_settings, read_arguments
@@ -130,7 +131,8 @@ def test_python_snippets_run(page, recording, tmp_path, monkeypatch):
     if "lerobot" in page:
         pytest.importorskip("accelerate")
     if "mujoco" in page:
-        pytest.importorskip("mujoco")
+        check_renderer()
+        pytest.importorskip("metaworld")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "datasets").mkdir()
     (tmp_path / "datasets/balance_reaching").symlink_to(recording, target_is_directory=True)
