@@ -159,7 +159,8 @@ def parse_lerobot(name, arguments, monkeypatch):
 @pytest.mark.slow
 def test_commands_of_lerobot_are_understood(tmp_path, parse_only, monkeypatch):
     """One after the other, in a folder where a training leaves its settings and ``python -c`` its exports."""
-    pytest.importorskip("accelerate")
+    for package in ("accelerate", "metaworld"):
+        pytest.importorskip(package)
     importlib.import_module("dynmap_rl.integrations.lerobot")
     monkeypatch.chdir(tmp_path)
     shutil.copytree(
