@@ -7,6 +7,7 @@ GYMNASIUM_IDS = {  # by task
     "balance_reaching_obstacle": "dynmap_rl/BalanceReachingObstacle-v1",
     "bin_dropping": "dynmap_rl/BinDropping-v1",
 }
+GYMNASIUM_TASK = "dynmap_rl/Task-v0"  # of any task, which is an argument
 
 CAMERAS = "observation.images."  # beginning of the LeRobot columns of frames
 CAMERA = f"{CAMERAS}front"  # column of the tasks of cart and block

@@ -1,14 +1,16 @@
 """Play a task, watch an expert or a policy, look into a world model, record demonstrations of a person.
 
     python recipes/play.py --task bin_dropping
+    python recipes/play.py --task mujoco:PlateSlide --driver expert
     python recipes/play.py --policy balance_reaching    # ships with the package; or a run folder
     python recipes/play.py --policy balance_reaching --imagine_from 20 --steps 120 --gif play.gif
     python recipes/play.py --record datasets/mine
 
-Arrows or WASD move the cart, Q and E tilt it, a pressed mouse button calls it; TAB changes the driver: hand, expert or
-policy. With a policy, the window also shows the world model's prediction, one step ahead or, in imagination (I), without
-frames. PAGE UP and PAGE DOWN make the policy's frames late; cart and block are then also drawn translucent, where the
-model believes them to be. B changes between cart and block in the traces, R takes the next scene, SPACE pauses, ESC ends.
+Arrows or WASD move the cart, Q and E tilt it, a pressed mouse button calls it; of a MuJoCo task, they move the hand as the
+first camera sees it, Q and E up and down. TAB changes the driver: hand, expert or policy. With a policy, the window also
+shows the world model's prediction, one step ahead or, in imagination (I), without frames. PAGE UP and PAGE DOWN make the
+policy's frames late; cart and block are then also drawn translucent, where the model believes them to be. B takes the next
+body in the traces, R the next scene, SPACE pauses, ESC ends.
 
 With --record, every successful episode that the hand alone drove is kept at once. At the end, the episodes become a
 LeRobot dataset with a page in runs/play; the next session adds to it.
@@ -25,7 +27,8 @@ from dynmap_rl.utils.cli import command_line, run_recipe
 class Config:
     """Settings of the recipe."""
 
-    # Task: balance_reaching, balance_reaching_obstacle, bin_dropping, or module:Class; by default the policy's.
+    # Task: balance_reaching, balance_reaching_obstacle, bin_dropping, mujoco:FetchPush (FetchSlide, PlateSlide, Soccer),
+    # or module:Class of your own; by default the policy's.
     task: str | None = None
     # Run with world model and policy: a folder, a hub id, or balance_reaching (shipped).
     policy: str | None = None
@@ -35,7 +38,7 @@ class Config:
     expert: str | None = None
     # Step of every episode from which the world model continues without frames, as if I were pressed.
     imagine_from: int | None = None
-    # Delay of the policy's frames in control steps of 50 ms, at most 20.
+    # Delay of the policy's frames in control steps, at most 20.
     delay: int = 0
     # First driver: hand, expert or policy; by default the policy where there is one.
     driver: str | None = None
@@ -57,9 +60,7 @@ def main(config: Config) -> None:
     """Play, record and upload."""
     from dynmap_rl.data.format.hub import push_dataset
     from dynmap_rl.data.recording.human import list_shards, next_scene, open_folder, publish_episodes
-    from dynmap_rl.envs.task import Task
     from dynmap_rl.envs.tasks import get_task
-    from dynmap_rl.envs.world import CONTROL_DT, EPISODE_STEPS
     from dynmap_rl.play.session import MAX_DELAY, Session
     from dynmap_rl.play.window import PlayWindow
     from dynmap_rl.reporting.dataset_page import write_dataset_page
@@ -69,14 +70,14 @@ def main(config: Config) -> None:
     run = find_run(config.policy) if config.policy else None
     task = config.task or (run and task_of_run(run)) or "balance_reaching"
     actor = load_actor(run, config.seed) if run else None
-    get_task(task, from_file=not config.task, kind=Task)
+    layout = get_task(task, from_file=not config.task).layout
     if config.size < 64 or (config.steps is not None and config.steps < 1):
         raise ValueError(
             f"--size must be at least 64 and --steps at least 1, got {config.size} and {config.steps}"
         )
-    if config.imagine_from is not None and not (actor and 1 <= config.imagine_from < EPISODE_STEPS):
+    if config.imagine_from is not None and not (actor and 1 <= config.imagine_from < layout.steps):
         raise ValueError(
-            f"--imagine_from must be a step of 1 to {EPISODE_STEPS - 1}, with --policy, got {config.imagine_from}"
+            f"--imagine_from must be a step of 1 to {layout.steps - 1}, with --policy, got {config.imagine_from}"
         )
     if not 0 <= config.delay <= (MAX_DELAY if actor else 0):
         raise ValueError(f"--delay must be 0 to {MAX_DELAY} steps, with --policy, got {config.delay}")
@@ -97,7 +98,7 @@ def main(config: Config) -> None:
         session.driver = config.driver
     window, frames = PlayWindow(session, config.size), []
     try:
-        play(config, task, session, window, frames, CONTROL_DT)
+        play(config, task, session, window, frames, layout.dt)
     finally:
         window.close()
         count = len(list_shards(config.record, task)) if config.record else 0

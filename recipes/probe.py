@@ -111,8 +111,8 @@ def load_world_models(runs: list[str]) -> dict:
     for run in runs:
         world_model, source = load_source(run.strip())
         name = f"{row_name(world_model.supervision, source['training'])}, {source['training']}"
-        if world_model.architecture == "plain":
-            name += ", plain"
+        if world_model.architecture != "glimpse":
+            name += f", {world_model.architecture}"
         if name in models:
             raise ValueError(f"--runs must be of different rows, got {name} twice")
         models[name] = world_model

@@ -23,10 +23,12 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.fixture(scope="session")
 def installed(tmp_path_factory):
-    """Return a folder with the package and LeRobot's plugin as their wheels install them, for ``PYTHONPATH``."""
+    """Return a folder with the package and LeRobot's plugins as their wheels install them, for ``PYTHONPATH``."""
     build_wheel = pytest.importorskip("hatchling.build").build_wheel
     wheels, site = tmp_path_factory.mktemp("wheels"), tmp_path_factory.mktemp("site")
-    for project in (ROOT, ROOT / "dynmap_rl/integrations/lerobot_policy_dynmap"):
+    plugins = sorted((ROOT / "dynmap_rl/integrations").glob("lerobot_*_dynmap"))
+    assert len(plugins) == 2
+    for project in (ROOT, *plugins):
         with contextlib.chdir(project):
             name = build_wheel(str(wheels))
         with zipfile.ZipFile(wheels / name) as wheel:

@@ -20,7 +20,9 @@ def name_module(path: Path) -> str:
 
 
 MODULES = {
-    name_module(path): path for path in sorted(PACKAGE.rglob("*.py")) if "lerobot_policy" not in str(path)
+    name_module(path): path
+    for path in sorted(PACKAGE.rglob("*.py"))
+    if not path.parent.name.startswith(("lerobot_env_", "lerobot_policy_"))
 }
 
 

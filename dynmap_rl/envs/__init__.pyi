@@ -11,6 +11,7 @@ from .scene import SceneRanges as SceneRanges
 from .scene import sample_scene as sample_scene
 from .scene import scene_seed as scene_seed
 from .task import Task as Task
+from .task_env import TaskEnv as TaskEnv
 from .tasks import BalanceReaching as BalanceReaching
 from .tasks import BalanceReachingObstacle as BalanceReachingObstacle
 from .tasks import BinDropping as BinDropping

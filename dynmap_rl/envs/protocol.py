@@ -199,6 +199,16 @@ class BaseTask(ABC):
         """
         return None
 
+    def hand_action(self, world: Any, direction: np.ndarray) -> np.ndarray:
+        """Return the action ``[A]`` of a person who presses keys in the play window.
+
+        Args:
+            world: world that the person sees.
+            direction: ``[3]`` of -1 to 1: to the right and to the top of the picture, and up (key Q).
+        """
+        limit = np.array(self.layout.action_limit)
+        return limit * np.resize(direction, len(limit)) * (np.arange(len(limit)) < len(direction))
+
     @property
     def is_scripted(self) -> bool:
         """Whether the task has a demonstrator."""

@@ -2,6 +2,8 @@ from .actor import Actor as Actor
 from .actor import LatentActor as LatentActor
 from .actor import make_policy_module as make_policy_module
 from .actor import make_world_model_module as make_world_model_module
+from .backbones import ResNetEncoder as ResNetEncoder
+from .backbones import ViTEncoder as ViTEncoder
 from .cameras import CameraDecoders as CameraDecoders
 from .cameras import CameraEncoders as CameraEncoders
 from .checkpoints import load_policy as load_policy

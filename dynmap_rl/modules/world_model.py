@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 
 import torch
 from torch import nn
 
+from .backbones import ResNetEncoder, ViTEncoder
 from .cameras import CameraDecoders, CameraEncoders
 from .decoder import DynamicsDecoder, PlainDecoder, SpriteDecoder
 from .encoder import GlimpseEncoder, PlainEncoder
@@ -15,7 +17,13 @@ from .precision import mixed_precision
 from .recurrent import State
 from .transition import Transition
 
-ARCHITECTURES = {"plain": (PlainEncoder, PlainDecoder), "glimpse": (GlimpseEncoder, SpriteDecoder)}
+ARCHITECTURES = {
+    "plain": (PlainEncoder, PlainDecoder),
+    "glimpse": (GlimpseEncoder, SpriteDecoder),
+    "resnet18": (ResNetEncoder, SpriteDecoder),
+    "resnet18_imagenet": (partial(ResNetEncoder, imagenet=True), SpriteDecoder),
+    "vit": (ViTEncoder, SpriteDecoder),
+}
 
 
 class WorldModel(nn.Module):
@@ -26,8 +34,10 @@ class WorldModel(nn.Module):
         dynamics: normaliser of each supervised quantity: any of position, velocity, acceleration, or none.
         latent_size: Z.
         hidden_size: H.
-        architecture: ``plain``, the paper's plain CNNs (:class:`PlainEncoder`, :class:`PlainDecoder`), or ``glimpse``
-            (:class:`GlimpseEncoder`, :class:`SpriteDecoder`).
+        architecture: ``plain``, the paper's plain CNNs (:class:`PlainEncoder`, :class:`PlainDecoder`), ``glimpse``
+            (:class:`GlimpseEncoder`, :class:`SpriteDecoder`), or, with the decoder of ``glimpse``, ``resnet18``,
+            ``resnet18_imagenet`` (:class:`ResNetEncoder`, which has random weights here in both cases) or ``vit``
+            (:class:`ViTEncoder`).
         image_size: side S of the frames of a camera, a multiple of 8.
         cameras: number of cameras, whose frames stand side by side; each has an encoder and a decoder of its own.
 

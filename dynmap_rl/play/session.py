@@ -10,10 +10,11 @@ import torch
 from tensordict import TensorDict
 
 from dynmap_rl.data.recording.plans import KEYS
+from dynmap_rl.envs.protocol import BaseTask
 from dynmap_rl.envs.scene import scene_seed
 from dynmap_rl.envs.task import Task
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
-from dynmap_rl.envs.world import ACTION_LIMIT, CONTROL_DT, EPISODE_STEPS
+from dynmap_rl.envs.world import ACTION_LIMIT, CONTROL_DT
 from dynmap_rl.experts.network import load_expert, task_of_expert
 from dynmap_rl.keys import DYNAMICS
 from dynmap_rl.modules.actor import Actor
@@ -29,7 +30,7 @@ class Hand:
     """Input of a person: a direction by keys, or a place by the mouse.
 
     Attributes:
-        direction: ``[3]`` of -1, 0 or 1: x, y, tilt.
+        direction: ``[3]`` of -1, 0 or 1: right, up in the picture, and tilt or, in space, up.
         target: place to go to (m), in place of x and y of the direction; None without one.
     """
 
@@ -38,7 +39,7 @@ class Hand:
         self.target: tuple[float, float] | None = None
 
     def action(self, commanded: np.ndarray, last: np.ndarray) -> np.ndarray:
-        """Return the action ``[3]`` (m, m, rad), with a gentle acceleration from the last one.
+        """Return the action of a cart, ``[3]`` (m, m, rad), with a gentle acceleration from the last one.
 
         Args:
             commanded: commanded cart pose, ``[3]`` (m, m, rad).
@@ -61,7 +62,7 @@ class Session:
     Args:
         task: name of the task.
         actor: world model and policy; without it there are no predictions and no policy drives.
-        expert: expert of the task; by default the one that ships with the package, where there is one.
+        expert: expert of the task; by default the task's own, or the one that ships with the package.
         seed: number of the first scene.
         split: split of the scenes.
         delay: age of the frames that the actor gets, in control steps.
@@ -72,10 +73,13 @@ class Session:
         imagining: whether world model and policy continue without frames, on predicted latents.
         hand: input of the person.
         td: present observation, ``[1]``.
-        prediction: prediction of the present: ``pixels`` uint8 ``[64, 64, 3]`` and ``[6]`` by quantity; empty in the
-            first step of an episode, and without a world model.
-        trace: true and predicted dynamics of this episode: ``(quantity, "true" | "predicted")`` to rows ``[6]``, NaN
+        prediction: prediction of the present: ``pixels`` uint8 ``[S, cameras * S, 3]`` and ``[D]`` by quantity; empty
+            in the first step of an episode, and without a world model.
+        trace: true and predicted dynamics of this episode: ``(quantity, "true" | "predicted")`` to rows ``[D]``, NaN
             without a prediction.
+
+    Raises:
+        ValueError: an expert is named for a task that has one of its own.
     """
 
     def __init__(
@@ -89,7 +93,8 @@ class Session:
     ):
         self.env = DynmapBatchedEnv(task, 1, from_pixels=True)
         self.actor, self.seed, self.split = actor, seed, split
-        self.expert, self.expert_task = _find_expert(self.env.task, expert or task, named=expert is not None)
+        self.task: BaseTask = self.env.task
+        self.expert, self.expert_task = _find_expert(self.task, expert or task, named=expert is not None)
         self.driver, self.hand = "policy" if actor else "hand", Hand()
         self.set_delay(delay)
 
@@ -102,7 +107,8 @@ class Session:
     @property
     def drivers(self) -> tuple[str, ...]:
         """Drivers that are available."""
-        available = {"hand": True, "expert": self.expert is not None, "policy": self.actor is not None}
+        expert = self.expert is not None or self.task.is_scripted
+        available = {"hand": True, "expert": expert, "policy": self.actor is not None}
         return tuple(driver for driver in DRIVERS if available[driver])
 
     @property
@@ -113,12 +119,12 @@ class Session:
     @property
     def over(self) -> bool:
         """Whether the episode's steps have passed."""
-        return self.world.steps >= EPISODE_STEPS
+        return self.world.steps >= self.env.layout.steps
 
     @property
     def succeeded(self) -> bool:
         """Whether the episode would be a success if it ended now."""
-        return self.env.task.is_success(self.world)
+        return self.task.is_success(self.world)
 
     def restart(self, seed: int | None = None) -> None:
         """Begin a new episode, with the next scene unless one is given."""
@@ -126,6 +132,7 @@ class Session:
         seeds = torch.tensor([scene_seed(self.split, self.seed)])
         self.td = self.env.reset(TensorDict({"scene_seed": seeds}, [1]))
         self.scene_seed, self.imagining = int(seeds), False
+        self.demonstrate = self.task.demonstrator(self.world)
         self.drove: set[str] = set()
         self.steps: list[TensorDict] = []
         self.trace = defaultdict(list)
@@ -142,11 +149,12 @@ class Session:
         self.drove.add(self.driver)
         seen = self._act()
         actions = {"hand": self._hand_action, "expert": self._expert_action, "policy": lambda: seen["action"]}
-        action = torch.as_tensor(np.asarray(actions[self.driver]()), dtype=torch.float32).reshape(1, 3)
+        action = torch.as_tensor(np.asarray(actions[self.driver]()), dtype=torch.float32).reshape(1, -1)
         td = self.env.step(self.td.set("action", action))
         if self.actor:
-            self._predict(seen.set("action", action))  # as in an evaluation: before the cart's limits
-        td["action"] = torch.as_tensor(self.world.action, dtype=torch.float32).reshape(1, 3)
+            self._predict(seen.set("action", action))  # as in an evaluation: before the limits
+        executed = self.world.action if isinstance(self.task, Task) else self.env.action_spec.project(action)
+        td["action"] = torch.as_tensor(executed, dtype=torch.float32).reshape(1, -1)
         td["expert_action"] = td["action"]  # who drives is the one to imitate
         self.steps.append(td.select(*KEYS).clone())
         self.td = td["next"]
@@ -157,9 +165,13 @@ class Session:
         return torch.stack(self.steps, 1)
 
     def _hand_action(self) -> np.ndarray:
+        if not isinstance(self.task, Task):
+            return self.task.hand_action(self.world, self.hand.direction)
         return self.hand.action(self.world.commanded, self.world.action)
 
     def _expert_action(self) -> np.ndarray:
+        if self.demonstrate:
+            return self.demonstrate()
         state = torch.from_numpy(self.expert_task.state(self.world))
         return self.world.action_for(self.expert(state)[0].numpy())
 
@@ -187,11 +199,16 @@ class Session:
         self.frames.append(self.td["pixels"])
         for quantity in DYNAMICS:
             self.trace[quantity, "true"].append(self.td["dynamics", quantity][0].numpy())
-            self.trace[quantity, "predicted"].append(self.prediction.get(quantity, np.full(6, np.nan)))
+            nothing = np.full(len(self.env.layout.dynamics[quantity]), np.nan)
+            self.trace[quantity, "predicted"].append(self.prediction.get(quantity, nothing))
 
 
-def _find_expert(task: Task, name: str | Path, named: bool):
+def _find_expert(task: BaseTask, name: str | Path, named: bool):
     """Return an expert and the task whose state it reads; None twice where none is named and none ships."""
+    if task.is_scripted:
+        if named:
+            raise ValueError(f"--expert has no effect with {task.name}, which has an expert of its own")
+        return None, None
     try:
         expert = load_expert(name)
     except ValueError:

@@ -7,20 +7,22 @@ import os
 import numpy as np
 
 from dynmap_rl.envs.renderer import Renderer, box, pygame
-from dynmap_rl.envs.world import ACCELERATION_LIMIT, CONTROL_DT, EPISODE_STEPS, VELOCITY_LIMIT
+from dynmap_rl.envs.task import Task
+from dynmap_rl.envs.world import ACCELERATION_LIMIT, VELOCITY_LIMIT
 from dynmap_rl.keys import DYNAMICS
 
 from .session import Session
 
 BLACK, GRAY, LIGHT, WHITE, GREEN = (0, 0, 0), (120, 120, 120), (225, 225, 225), (255, 255, 255), (44, 160, 44)
 LINE, MARGIN, TRACE = 20, 8, 84  # pixels
-COMPONENTS = "x", "y", "theta"
 UNITS = {"position": "m", "velocity": "m/s", "acceleration": "m/s2"}
 LOW = {"position": [0, 0, -0.5], "velocity": -VELOCITY_LIMIT, "acceleration": -2 * ACCELERATION_LIMIT}
 HIGH = {"position": [1, 1, 0.5], "velocity": VELOCITY_LIMIT, "acceleration": 2 * ACCELERATION_LIMIT}
+LEAST = {"position": 0.1, "velocity": 0.4, "acceleration": 4.0}  # height of a trace in space
 HELP = (
-    "arrows or WASD: move; Q, E: tilt; mouse button: go there",
-    "TAB: who drives; I: imagination; B: cart or block",
+    "arrows or WASD: move; Q, E: tilt, or up and down;",
+    "mouse button: call the cart",
+    "TAB: who drives; I: imagination; B: next body",
     "PAGE UP, PAGE DOWN: delay of the policy's frames",
     "R: next scene; SPACE: pause; ESC: end",
 )
@@ -33,6 +35,8 @@ KEYS = {  # axis and sign
 class PlayWindow:
     """Window that shows a session and passes keys and mouse to it.
 
+    Tasks of cart and block are drawn in full resolution; of other tasks, the frame of the first camera is shown.
+
     Args:
         session: session to show.
         size: side of the scene, in pixels.
@@ -43,7 +47,10 @@ class PlayWindow:
 
     def __init__(self, session: Session, size: int = 384):
         self.session, self.size = session, size
-        self.body, self.paused, self.open = 3, False, True
+        self.dt, self.flat = session.env.layout.dt, isinstance(session.task, Task)
+        self.bodies = list(dict.fromkeys(name.partition("_")[0] for name in session.env.layout.velocity))
+        self.body = self.bodies[-1] if self.flat else self.bodies[0]  # the object that is moved
+        self.paused, self.open = False, True
         self.held: set[str] = set()
         pygame.font.init()
         self.width = 2 * size + 3 * MARGIN
@@ -60,7 +67,7 @@ class PlayWindow:
             ) from error
         pygame.display.set_caption("dynmap_rl")
         self.font = pygame.font.Font(None, LINE)
-        self.renderer = Renderer(size, supersample=2)
+        self.renderer = Renderer(size, supersample=2) if self.flat else None
 
     def close(self) -> None:
         """Close the window."""
@@ -96,7 +103,7 @@ class PlayWindow:
         elif key == "r":
             session.restart()
         elif key == "b":
-            self.body = 3 - self.body
+            self.body = self.bodies[(self.bodies.index(self.body) + 1) % len(self.bodies)]
         elif key == "i" and session.actor:
             session.imagining = not session.imagining
         elif key in ("page up", "page down"):
@@ -108,46 +115,50 @@ class PlayWindow:
     def _point(self, event) -> None:
         pressed = event.type == pygame.MOUSEBUTTONDOWN or event.buttons[0]
         x, y = (event.pos[0] - MARGIN) / self.size, 1 - (event.pos[1] - MARGIN - LINE) / self.size
-        if pressed and 0 <= x <= 1 and 0 <= y <= 1:
+        if self.flat and pressed and 0 <= x <= 1 and 0 <= y <= 1:
             self.session.driver, self.session.hand.target = "hand", (x, y)
 
     def draw(self) -> np.ndarray:
         """Draw the present and return the picture, uint8 ``[height, width, 3]``."""
         session, size = self.session, self.size
         self.screen.fill(WHITE)
-        self._write(f"{session.env.task.name}: {session.driver} drives", MARGIN, MARGIN)
-        self._show(self.renderer.draw(session.world, session.env.task), MARGIN)
-        if "position" in session.prediction and (session.delay or session.imagining):
+        self._write(f"{session.task.name}: {session.driver} drives", MARGIN, MARGIN)
+        self._show(self._draw_scene(), MARGIN)
+        if self.flat and "position" in session.prediction and (session.delay or session.imagining):
             self._show_belief(session.prediction["position"])
         right = 2 * MARGIN + size
         if "pixels" in session.prediction:
-            age = round(1000 * CONTROL_DT * (session.delay + 1))
+            age = round(1000 * self.dt * (session.delay + 1))
             source = "imagination, without frames" if session.imagining else f"prediction from {age} ms ago"
             self._write(f"world model: {source}", right, MARGIN)
-            self._show(session.prediction["pixels"], right)
+            self._show(_first_camera(session.prediction["pixels"]), right)
         else:
             for i, line in enumerate(HELP):
                 self._write(line, right, MARGIN + LINE * (i + 2), GRAY)
         self._write(self._status(), MARGIN, 2 * MARGIN + LINE + size)
         for row, quantity in enumerate(DYNAMICS):
-            for column in range(3):
-                self._trace(quantity, column, row)
+            names = session.env.layout.dynamics[quantity]
+            entries = [i for i, name in enumerate(names) if name.partition("_")[0] == self.body]
+            for column, entry in enumerate(entries[:3]):
+                self._trace(quantity, entry, column, row)
         pygame.display.flip()
         return pygame.surfarray.array3d(self.screen).swapaxes(0, 1)
 
+    def _draw_scene(self) -> np.ndarray:
+        if self.renderer:
+            return self.renderer.draw(self.session.world, self.session.task)
+        return _first_camera(self.session.td["pixels"][0].permute(1, 2, 0).numpy())
+
     def _status(self) -> str:
         session, world = self.session, self.session.world
-        name = "block" if self.body else "cart"
+        way = world.goal_distance if self.flat else world.position_error
         state = (
-            "success"
-            if session.succeeded
-            else "dropped"
-            if world.dropped
-            else f"{1000 * world.goal_distance:.0f} mm to go"
+            "success" if session.succeeded else "dropped" if world.dropped else f"{1000 * way:.0f} mm to go"
         )
+        steps = f"step {world.steps} of {session.env.layout.steps}"
         return (
-            f"step {world.steps} of {EPISODE_STEPS}; {state}; {name}'s dynamics: black true, green predicted"
-            + (f"; frames {round(1000 * CONTROL_DT * session.delay)} ms late" if session.delay else "")
+            f"{steps}; {state}; {self.body}'s dynamics: black true, green predicted"
+            + (f"; frames {round(1000 * self.dt * session.delay)} ms late" if session.delay else "")
             + ("; paused" if self.paused else "")
         )
 
@@ -169,19 +180,35 @@ class PlayWindow:
     def _write(self, text: str, x: int, y: int, color=BLACK) -> None:
         self.screen.blit(self.font.render(text, True, color), (x, y))
 
-    def _trace(self, quantity: str, column: int, row: int) -> None:
+    def _trace(self, quantity: str, entry: int, column: int, row: int) -> None:
         width = (self.width - 4 * MARGIN) // 3
         left = MARGIN + column * (width + MARGIN)
         top = 2 * MARGIN + 2 * LINE + self.size + row * TRACE
         area = pygame.Rect(left, top + LINE - 4, width, TRACE - LINE - 2)
-        unit = UNITS[quantity] if column < 2 else UNITS[quantity].replace("m", "rad", 1)
-        self._write(f"{quantity} {COMPONENTS[column]} [{unit}]", left, top, GRAY)
+        layout, trace = self.session.env.layout, self.session.trace
+        component = layout.dynamics[quantity][entry].removeprefix(f"{self.body}_")
+        unit = UNITS[quantity].replace("m", "rad", 1) if component == "theta" else UNITS[quantity]
+        self._write(f"{quantity} {component} [{unit}]", left, top, GRAY)
         pygame.draw.rect(self.screen, LIGHT, area, 1)
+        lines = {kind: np.array(trace[quantity, kind])[:, entry] for kind in ("true", "predicted")}
         low, high = LOW[quantity][column], HIGH[quantity][column]
+        if not self.flat:
+            low, high = _limits(lines["true"], LEAST[quantity])
         for kind, color in (("true", BLACK), ("predicted", GREEN)):
-            values = np.array(self.session.trace[quantity, kind])[:, self.body + column]
+            values = lines[kind]
             steps = np.flatnonzero(np.isfinite(values))
             if len(steps) > 1:
-                x = area.left + steps / EPISODE_STEPS * area.width
+                x = area.left + steps / layout.steps * area.width
                 y = area.bottom - ((values[steps] - low) / (high - low)).clip(0, 1) * area.height
                 pygame.draw.lines(self.screen, color, False, np.stack([x, y], 1).tolist())
+
+
+def _first_camera(frame: np.ndarray) -> np.ndarray:
+    """Return the frame of the first of several cameras side by side."""
+    return frame[:, : frame.shape[0]]
+
+
+def _limits(values: np.ndarray, least: float) -> tuple[float, float]:
+    """Return the lower and the upper end of a trace that holds all values and has at least a height."""
+    middle, half = (values.max() + values.min()) / 2, max(np.ptp(values), least) / 2
+    return middle - half, middle + half

@@ -17,12 +17,13 @@ class WorldModelArchitecture:
 
     # Dynamics that the world model predicts: any of position,velocity,acceleration, or none (Only-RGB).
     supervision: str = "position,velocity"
-    # glimpse (small images that move with attention maps, read by the encoder and drawn by the decoder), or the paper's
-    # plain CNNs.
+    # glimpse (small images that move with attention maps, read by the encoder and drawn by the decoder), the paper's plain
+    # CNNs, or glimpse with an encoder of torchvision: resnet18, resnet18_imagenet (begins with weights that torchvision
+    # downloads) or vit.
     architecture: str = "glimpse"
 
     def __post_init__(self):
-        check_choice(self, "architecture", ("glimpse", "plain"))
+        check_choice(self, "architecture", ("glimpse", "plain", "resnet18", "resnet18_imagenet", "vit"))
         for name in self.supervision.split(","):
             if name.strip() not in ("none", *DYNAMICS) or (
                 "none" in self.supervision and "," in self.supervision

@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDictBase
 
 from dynmap_rl.evaluation.errors import prediction_errors
+from dynmap_rl.modules.backbones import ResNetEncoder
 from dynmap_rl.modules.checkpoints import make_world_model
 from dynmap_rl.modules.supervision import parse_supervision
 from dynmap_rl.modules.world_model import WorldModel
@@ -21,18 +22,26 @@ from .settings import JointTraining, WorldModelArchitecture, WorldModelTraining
 def build_world_model(
     constants: dict, settings: WorldModelArchitecture, episodes: TensorDictBase | None = None
 ) -> WorldModel:
-    """Make a world model with random weights.
+    """Make a world model with random weights; the encoder ``resnet18_imagenet`` has weights of torchvision.
 
     Args:
         constants: of the dataset's normalisation, ``{name: {"low": [D], "high": [D]}}``.
         settings: form of the world model.
         episodes: episodes with ``pixels`` ``[..., 3, S, cameras * S]``, which give the size of the frames; by default
             one camera of 64 x 64.
+
+    Raises:
+        ValueError: torchvision is missing or does not fit, or its weights cannot be loaded.
     """
     supervision = parse_supervision(settings.supervision)
     height, width = (64, 64) if episodes is None else episodes["pixels"].shape[-2:]
     frames = {"image_size": height, "cameras": width // height}
-    return make_world_model(constants, supervision, architecture=settings.architecture, **frames)
+    model = make_world_model(constants, supervision, architecture=settings.architecture, **frames)
+    if settings.architecture == "resnet18_imagenet":
+        for part in model.encoder.modules():
+            if isinstance(part, ResNetEncoder):
+                part.load_imagenet()
+    return model
 
 
 def train_world_model(

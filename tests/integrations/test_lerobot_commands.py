@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from commands import run
+from own_task import check_renderer
 from safetensors.torch import load_file
 
 from dynmap_rl.data.demonstrations import load_dataset
@@ -166,3 +168,35 @@ def test_viewer_takes_an_episode(recording, lerobot, tmp_path):
     arguments = ["--repo-id=user/small", f"--root={recording}", "--episode-index=1", "--num-workers=0"]
     lerobot("dataset-viz", *arguments, "--save=1", f"--output-dir={tmp_path}")
     assert (tmp_path / "user_small_episode_1.rrd").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("kind", ["act", "diffusion"])
+def test_policies_of_lerobot_learn_a_benchmark(kind, lerobot, tmp_path):
+    """By commands on the installed plugin; two cameras and larger frames."""
+    check_renderer()
+    pytest.importorskip("metaworld")
+    task = "mujoco:PlateSlide:image_size=96,cameras=2"
+    sizes = "--episodes", "2", "--eval_episodes", "1", "--workers", "1", "--output", "recorded"
+    assert run(tmp_path, "collect", "--task", task, *sizes).returncode == 0
+    lerobot("train", *train_arguments(kind, tmp_path / "recorded", tmp_path / "train", 1))
+    path = tmp_path / "train/checkpoints/last/pretrained_model"
+    info = evaluate(lerobot, path, task, tmp_path / "eval")
+    assert info["overall"]["n_episodes"] == 1
+    judged = run(tmp_path, "evaluate", "--policy", path, "--task", task, "--eval.episodes", "2")
+    assert judged.returncode == 0, judged.stderr
+
+
+def test_lerobot_finds_the_environment_by_itself(command, tmp_path):
+    script = tmp_path / "find.py"
+    script.write_text(
+        "from lerobot.utils.import_utils import register_third_party_plugins\n"
+        "import importlib.metadata, json, sys\n"
+        "names = [d.metadata['Name'] for d in importlib.metadata.distributions()]\n"
+        "register_third_party_plugins()\n"
+        "from lerobot.envs import make_env_config\n"
+        "config = make_env_config('dynmap', task='balance_reaching')\n"
+        "print(json.dumps(['lerobot_env_dynmap' in names, 'lerobot_env_dynmap' in sys.modules, config.fps]))\n"
+    )
+    done = command(tmp_path, script)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout.splitlines()[-1]) == [True, True, 20]

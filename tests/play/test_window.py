@@ -40,7 +40,7 @@ def test_keys_and_mouse(window):
     assert played.hand.target == (0.5, 0.5)
     pygame.event.post(pygame.event.Event(pygame.MOUSEBUTTONUP, middle))
     press(window, "space", "b")
-    assert played.hand.target is None and window.paused and window.body == 0
+    assert played.hand.target is None and window.paused and window.body == "cart"
     first = played.scene_seed
     press(window, "r", "i", "f5")
     assert played.scene_seed != first and not played.imagining

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 import torch
 from commands import run, run_small
-from own_task import own_task  # noqa: F401
+from own_task import check_renderer, own_task  # noqa: F401
+from PIL import Image
 
 from dynmap_rl.data.demonstrations import load_dataset, load_demonstrations, load_meta
 from dynmap_rl.envs.protocol import Layout
 from dynmap_rl.envs.tasks import get_task
+from dynmap_rl.play.session import Session
 from dynmap_rl.runs.lookup import load_actor
 
 
@@ -90,6 +92,32 @@ def test_the_expert_is_judged(recorded):
     assert result["rates"]["success"] == 100 and result["expert"] == "scripted"
 
 
+def test_a_person_and_the_expert_drive(own_task):  # noqa: F811
+    session = Session(own_task)
+    assert session.drivers == ("hand", "expert")
+    session.hand.direction[:] = 1, 0, 0  # to the right, as the camera looks along y
+    session.step()
+    assert session.td["dynamics", "velocity"][0, 6] > 0 and session.steps[0]["action"].tolist() == [[1.0]]
+    session.restart()
+    session.driver = "expert"
+    while not session.over:
+        session.step()
+    assert session.succeeded and session.episode().shape == (1, 40)
+    assert np.isnan(session.trace["position", "predicted"]).all()
+
+
+def test_a_policy_is_watched_and_a_person_recorded(recorded, tmp_path, monkeypatch):
+    """The expert acts in the place of the person."""
+    _, task = recorded
+    monkeypatch.setattr(Session, "_hand_action", Session._expert_action)
+    arguments = "--task", task, "--driver", "hand", "--record", "mine", "--steps", "101", "--size", "64"
+    played = run(tmp_path, "play", *arguments, "--gif", "film.gif")
+    assert played.returncode == 0, played.stderr
+    assert load_dataset(tmp_path / "mine").shape == (2, 40)
+    with Image.open(tmp_path / "film.gif") as film:
+        assert film.n_frames > 1
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("recipe", ["joint", "end_to_end"])
 def test_other_trainings_take_the_task(recorded, recipe):
@@ -102,10 +130,34 @@ def test_other_trainings_take_the_task(recorded, recipe):
     [
         ("collect", ["--expert", "balance_reaching"], "has an expert of its own"),
         ("expert", [], "must be a Task here"),
-        ("play", [], "must be a Task here"),
+        ("play", ["--expert", "balance_reaching"], "has an expert of its own"),
         ("decoupled", ["--dataset", "datasets/push_image_size_96_cameras_2"], "dataset of"),
     ],
 )
 def test_what_has_no_effect_is_refused(recorded, own_task, recipe, arguments, message):  # noqa: F811
     result = run(recorded[0], recipe, "--task", own_task, *arguments)
     assert result.returncode == 2 and message in result.stderr, result.stderr
+
+
+@pytest.mark.slow
+def test_a_benchmark_goes_through_the_whole_pipeline(tmp_path):
+    """Recorded, trained in three ways, judged, watched and described, by the commands of the pages."""
+    check_renderer()
+    pytest.importorskip("metaworld")
+    task, sizes = "mujoco:PlateSlide", ("--episodes", "3", "--eval_episodes", "2", "--workers", "1")
+    recorded = run(tmp_path, "collect", "--task", task, *sizes)
+    assert recorded.returncode == 0, recorded.stderr
+    for recipe in ("decoupled", "joint", "end_to_end"):
+        run_small(tmp_path, recipe, "--task", task, pictures=recipe == "decoupled")
+        [file] = (tmp_path / "runs" / recipe / "plate_slide").glob("*/eval.json")
+        result = json.loads(file.read_text())
+        assert result["test_protocol"]["episodes"] == 3 and result["task"] == task
+        assert "data:image/gif" in (file.with_name("report.html")).read_text() or recipe != "decoupled"
+    policy = tmp_path / "runs/decoupled/plate_slide/position_velocity_recurrent"
+    for options in (["--policy", policy], ["--policy", policy, "--delay", "3"], ["--task", task]):
+        judged = run(tmp_path, "evaluate", *options, "--eval.episodes", "2")
+        assert judged.returncode == 0, judged.stderr
+    watched = run(
+        tmp_path, "play", "--policy", policy, "--steps", "6", "--imagine_from", "3", "--gif", "film.gif"
+    )
+    assert watched.returncode == 0 and (tmp_path / "film.gif").exists(), watched.stderr

@@ -11,6 +11,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from own_task import check_renderer
 
 from dynmap_rl.runs.lookup import SHIPPED
 from dynmap_rl.utils.cli import parse_settings, read_arguments
@@ -130,7 +131,8 @@ def test_python_snippets_run(page, recording, tmp_path, monkeypatch):
     if "lerobot" in page:
         pytest.importorskip("accelerate")
     if "mujoco" in page:
-        pytest.importorskip("mujoco")
+        check_renderer()
+        pytest.importorskip("metaworld")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "datasets").mkdir()
     (tmp_path / "datasets/balance_reaching").symlink_to(recording, target_is_directory=True)
@@ -157,7 +159,8 @@ def parse_lerobot(name, arguments, monkeypatch):
 @pytest.mark.slow
 def test_commands_of_lerobot_are_understood(tmp_path, parse_only, monkeypatch):
     """One after the other, in a folder where a training leaves its settings and ``python -c`` its exports."""
-    pytest.importorskip("accelerate")
+    for package in ("accelerate", "metaworld"):
+        pytest.importorskip(package)
     importlib.import_module("dynmap_rl.integrations.lerobot")
     monkeypatch.chdir(tmp_path)
     shutil.copytree(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,12 +10,14 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
+from dynmap_rl.envs.protocol import BaseTask, SimulatedWorld
 from dynmap_rl.envs.scene import scene_seed
 from dynmap_rl.envs.task import Task
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.envs.world import EPISODE_STEPS, LARGEST_CHANGE, World, limit_actions
 from dynmap_rl.experts.network import list_checkpoints, load_expert
+from dynmap_rl.keys import DYNAMICS
 
 SCRIPTED = "scripted"  # in the place of a checkpoint
 KEYS = [
@@ -172,23 +175,36 @@ def demonstrate(task: str, plans: list[Plan]) -> TensorDict:
     Returns:
         ``[E, T]``, as :func:`roll_out` returns them.
     """
-    env, episodes = DynmapBatchedEnv(task, 1, from_pixels=True), []
-    limit = env.action_spec.high[0]
+    rules, world, episodes = get_task(task), None, []
+    draw = rules.make_renderer()
     for plan in plans:
-        td, steps = env.reset(TensorDict({"scene_seed": torch.tensor([plan.scene_seed])}, [1])), []
-        expert = env.task.demonstrator(env.worlds[0])
-        rng = np.random.default_rng([plan.scene_seed, 1])
-        for _ in range(env.layout.steps):
-            expert_action = torch.as_tensor(expert(), dtype=torch.float32)
-            noise = torch.from_numpy(plan.noise * rng.standard_normal(len(limit))).float() * limit
-            noise = noise * (not getattr(expert, "exact", False))
-            td["action"] = (expert_action + noise).clamp(-limit, limit)[None]
-            td["expert_action"] = expert_action.clamp(-limit, limit)[None]
-            td = env.step(td)
-            steps.append(td.select(*KEYS))
-            td = td["next"]
-        episodes.append(torch.stack(steps, 1))
-    return torch.cat(episodes)
+        world = rules.begin(plan.scene_seed, None, world)
+        rows = list(_demonstrate(rules, draw, world, plan))
+        steps = {key: torch.from_numpy(np.stack([row[key] for row in rows])) for key in rows[0]}
+        episodes.append(TensorDict(steps, [len(rows)]).unflatten_keys("."))
+    out = torch.stack(episodes)
+    out["pixels"] = out["pixels"].permute(0, 1, 4, 2, 3)
+    return out
+
+
+def _demonstrate(rules: BaseTask, draw: Callable, world: SimulatedWorld, plan: Plan) -> Iterator[dict]:
+    """Yield the steps of an episode as arrays; TensorDicts would take longer than the simulator."""
+    rng, expert, layout = np.random.default_rng([plan.scene_seed, 1]), rules.demonstrator(world), rules.layout
+    limit = np.array(layout.action_limit, np.float32)
+    for t in range(layout.steps):
+        agent_pos = np.asarray(rules.agent_pos(world), np.float32)
+        row = {"pixels": draw(world), "agent_pos": agent_pos, "goal": agent_pos[-layout.goal_size :]}
+        row |= {f"dynamics.{name}": getattr(world, name).astype(np.float32) for name in DYNAMICS}
+        action = np.asarray(expert(), np.float32)
+        noise = plan.noise * rng.standard_normal(len(limit)).astype(np.float32) * limit
+        noise = noise * (not getattr(expert, "exact", False))
+        row |= {"action": (action + noise).clip(-limit, limit), "expert_action": action.clip(-limit, limit)}
+        rules.step([world], [row["action"]])
+        end = {"done": t + 1 == layout.steps or rules.is_over(world), "dropped": world.dropped}
+        end |= {"is_success": rules.is_success(world)}
+        row |= {f"next.{name}": np.array([value], bool) for name, value in end.items()}
+        values = {"reward": rules.reward(world), "position_error": world.position_error}
+        yield row | {f"next.{name}": np.array([value], np.float32) for name, value in values.items()}
 
 
 def mark_pushes(plans: list[Plan], steps: int = EPISODE_STEPS) -> torch.Tensor:

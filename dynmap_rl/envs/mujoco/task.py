@@ -221,5 +221,13 @@ class MujocoTask(BaseTask):
     def reward(self, world: MujocoWorld) -> float:
         return world.reward
 
+    def hand_action(self, world: MujocoWorld, direction: np.ndarray) -> np.ndarray:
+        """Return the action that moves along ``direction`` ``[3]`` as the first camera sees it: right, away and up."""
+        azimuth = np.deg2rad(self.cameras[0].azimuth)
+        away, right = (np.cos(azimuth), np.sin(azimuth)), (np.sin(azimuth), -np.cos(azimuth))
+        x, y = direction[0] * np.array(right) + direction[1] * np.array(away)
+        way = {"x": x, "y": y, "z": direction[2]}
+        return self.action_limit * np.array([way.get(name, 0.0) for name in self.action])
+
     def describe(self, seed: int) -> dict[str, Any]:
         return {"seed": seed % 2**32}

@@ -2,7 +2,7 @@
 
 Importing it registers the environment ``dynmap``, the policy ``dynmap`` and the robot ``dynmap``. LeRobot does so by
 ``--policy.discover_packages_path=dynmap_rl.integrations.lerobot``, or without an option where the distribution in
-``dynmap_rl/integrations/lerobot_policy_dynmap`` is installed.
+``dynmap_rl/integrations/lerobot_policy_dynmap`` or ``lerobot_env_dynmap`` beside it is installed.
 """
 
 from .actor import LeRobotActor

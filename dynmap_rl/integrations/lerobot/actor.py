@@ -18,8 +18,8 @@ from dynmap_rl.utils.hub import first_line
 class LeRobotActor(TensorDictModuleBase):
     """Trained LeRobot policy as a TensorDict policy, one time step a call.
 
-    It reads ``pixels`` ``[B, 3, 64, 64]`` and ``agent_pos`` ``[B, 5]`` and writes ``action`` ``[B, 3]`` (m, m, rad). Its
-    memory (chunks of actions, past observations) belongs to one batch of episodes, which all begin at the same time:
+    It reads ``pixels`` ``[B, 3, S, cameras * S]`` and ``agent_pos`` and writes ``action`` ``[B, A]``, with the sizes of the
+    task's layout (see :class:`dynmap_rl.envs.Layout`). The cameras are those of the policy, in this order. Its memory (chunks of actions, past observations) belongs to one batch of episodes, which all begin at the same time:
     call :meth:`reset` before the first step of the next batch.
 
     Args:
@@ -31,6 +31,8 @@ class LeRobotActor(TensorDictModuleBase):
 
     Raises:
         ValueError: the folder or id holds no LeRobot policy.
+
+    Calling it raises ``ValueError`` where the policy has another number of cameras.
     """
 
     in_keys = ["pixels", "agent_pos"]
@@ -68,7 +70,10 @@ class LeRobotActor(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action of this step."""
         before, after = self.processors
-        observation = {CAMERA: tensordict["pixels"].float() / 255, OBS_STATE: tensordict["agent_pos"]}
+        frames = tensordict["pixels"].float() / 255
+        frames = frames.split(frames.shape[-2], -1)
+        names = list(self.policy.config.image_features) if len(frames) > 1 else [CAMERA]
+        observation = dict(zip(names, frames, strict=True)) | {OBS_STATE: tensordict["agent_pos"]}
         batch = before({**observation, "task": [self.instruction] * len(tensordict)})
         action = self._cut(batch, tensordict["delay"]) if self.cut else self.policy.select_action(batch)
         return tensordict.set("action", after(action).to(tensordict["agent_pos"]))

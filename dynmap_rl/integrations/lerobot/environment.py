@@ -1,8 +1,8 @@
-"""The Gymnasium environments as the LeRobot environment ``dynmap``."""
+"""The tasks as the LeRobot environment ``dynmap``."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 
 import gymnasium as gym
@@ -16,9 +16,8 @@ from lerobot.utils.constants import ACTION, OBS_IMAGE, OBS_STATE
 
 from dynmap_rl.envs.delay import DelayFrames, FrameDelay
 from dynmap_rl.envs.scene import scene_seed
-from dynmap_rl.envs.task import LAYOUT
-from dynmap_rl.envs.world import EPISODE_STEPS
-from dynmap_rl.keys import CAMERA, FRAME_SHAPE, GYMNASIUM_IDS
+from dynmap_rl.envs.tasks import get_task
+from dynmap_rl.keys import CAMERA, CAMERAS, GYMNASIUM_IDS, GYMNASIUM_TASK
 
 
 @EnvConfig.register_subclass("dynmap")
@@ -27,9 +26,10 @@ class DynmapEnvConfig(EnvConfig):
     """Settings of ``--env.type=dynmap``; observations have the names of the datasets' columns.
 
     Attributes:
-        task: ``balance_reaching``, ``balance_reaching_obstacle`` or ``bin_dropping``.
-        fps: 20, by definition of the tasks.
-        episode_length: 120, by definition of the tasks.
+        task: ``balance_reaching``, ``balance_reaching_obstacle``, ``bin_dropping``, a MuJoCo task such as
+            ``mujoco:PlateSlide``, or ``module:Class`` of your own.
+        fps: control steps per second, by definition of the task.
+        episode_length: control steps, by definition of the task.
         split: split of the scenes. ``--seed`` counts within the split, so that no evaluation uses scenes of the
             demonstrations: ``test`` with 0 to 999 are the start states of the tables, ``validation`` is for choosing
             settings.
@@ -43,34 +43,44 @@ class DynmapEnvConfig(EnvConfig):
     """
 
     task: str | None = "balance_reaching"
-    fps: int = LAYOUT.fps
-    episode_length: int = EPISODE_STEPS
+    fps: int | None = None
+    episode_length: int | None = None
     split: str = "test"
     render_size: int = 256
     delay: int = 0
     jitter: int = 0
     lost: float = 0.0
-    features: dict[str, PolicyFeature] = field(
-        default_factory=lambda: {
-            ACTION: PolicyFeature(FeatureType.ACTION, (3,)),
-            "agent_pos": PolicyFeature(FeatureType.STATE, (5,)),
-            "pixels": PolicyFeature(FeatureType.VISUAL, FRAME_SHAPE),
-        }
-    )
-    features_map: dict[str, str] = field(
-        default_factory=lambda: {ACTION: ACTION, "agent_pos": OBS_STATE, "pixels": CAMERA}
-    )
 
     def __post_init__(self):
-        if self.task not in GYMNASIUM_IDS:
-            raise ValueError(f"--env.task must be one of {', '.join(GYMNASIUM_IDS)}, got {self.task!r}")
+        layout = get_task(self.task).layout
         scene_seed(self.split, 0)
         FrameDelay(self.delay, self.jitter, self.lost)
-        if (self.fps, self.episode_length) != (LAYOUT.fps, EPISODE_STEPS):
+        given = self.fps or layout.fps, self.episode_length or layout.steps
+        if given != (layout.fps, layout.steps):
             raise ValueError(
-                f"--env.episode_length and --env.fps must be {EPISODE_STEPS} and {LAYOUT.fps}, got {self.episode_length} and "
-                f"{self.fps}"
+                f"--env.fps and --env.episode_length of {self.task} must be {layout.fps} and {layout.steps}, got "
+                f"{given[0]} and {given[1]}"
             )
+        self.fps, self.episode_length = given
+        side = layout.image_size
+        frames = {name: f"{CAMERAS}{camera}" for name, camera in self._frames.items()}
+        self.features = {
+            ACTION: PolicyFeature(FeatureType.ACTION, (len(layout.action),)),
+            "agent_pos": PolicyFeature(FeatureType.STATE, (len(layout.state),)),
+            **{name: PolicyFeature(FeatureType.VISUAL, (side, side, 3)) for name in frames},
+        }
+        self.features_map = {ACTION: ACTION, "agent_pos": OBS_STATE, **frames}
+
+    @property
+    def _frames(self) -> dict[str, str]:
+        """Cameras by the names that LeRobot gives the frames of an environment."""
+        cameras = get_task(self.task).layout.cameras
+        return {"pixels": cameras[0]} if self._flat else {f"pixels/{camera}": camera for camera in cameras}
+
+    @property
+    def _flat(self) -> bool:
+        """Whether the task has a Gymnasium id of its own, whose frames are no dict."""
+        return self.task in GYMNASIUM_IDS
 
     @property
     def package_name(self) -> str:
@@ -80,12 +90,13 @@ class DynmapEnvConfig(EnvConfig):
     @property
     def gym_id(self) -> str:
         """Gymnasium id of the task."""
-        return GYMNASIUM_IDS[self.task]
+        return GYMNASIUM_IDS.get(self.task, GYMNASIUM_TASK)
 
     @property
     def gym_kwargs(self) -> dict:
         """Arguments of the Gymnasium environment."""
-        return {"obs_type": "pixels_agent_pos", "render_mode": "rgb_array", "render_size": self.render_size}
+        own = {"obs_type": "pixels_agent_pos"} if self._flat else {"task": self.task}
+        return {"render_mode": "rgb_array", "render_size": self.render_size, **own}
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, VectorEnv]]:
         """Make one vector environment of ``n_envs`` scenes, as ``{suite: {number: environments}}``."""
@@ -108,7 +119,7 @@ class _ForLeRobot(gym.Wrapper):
     """Adapter of resets and ``info`` to LeRobot.
 
     Seeds count within a split. The mark of a new rollout that LeRobot adds to the options of a reset is removed, since
-    options are factors of the scene here. ``info`` has plain values: a vector environment would store NumPy's booleans
+    options are factors of a scene of cart and block. ``info`` has plain values: a vector environment would store NumPy's booleans
     as objects.
     """
 

@@ -1,0 +1,93 @@
+"""Any task as a Gymnasium environment, with the observations of its datasets."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from .tasks import get_task
+
+
+class TaskEnv(gym.Env):
+    """One world of any task, such as ``mujoco:FetchSlide`` or one of your own.
+
+    The class :class:`dynmap_rl.envs.DynmapEnv` has more for the tasks of cart and block.
+
+    Action: float32 ``(A,)`` within the limits of the task's layout; actions beyond are cut.
+
+    Observation: dict of ``pixels``, itself a dict with a frame uint8 ``(S, S, 3)`` for each camera, and ``agent_pos``,
+    float32, all that a policy may read besides the frames; the goal stands last.
+
+    Info: ``is_success``, in the last step only, ``dropped`` and ``position_error`` (m), as numpy scalars.
+
+    End: the episode is truncated after the steps of the layout, and terminates where the task says that it has failed.
+
+    Args:
+        task: name of the task.
+        render_mode: ``rgb_array`` or None.
+        render_size: side of the picture that ``render()`` returns, in pixels; it is the first camera's frame, enlarged by
+            a whole number.
+
+    Raises:
+        ValueError: an argument is not valid.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
+
+    def __init__(self, task: str, render_mode: str | None = None, render_size: int = 256):
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode must be rgb_array or None, got {render_mode!r}")
+        self.task, self.render_mode, self.render_size = get_task(task), render_mode, render_size
+        self.task_description, layout = self.task.description, self.task.layout
+        self.metadata = self.metadata | {"render_fps": layout.fps}
+        self._max_episode_steps = layout.steps
+        limit = np.array(layout.action_limit, np.float32)
+        self.action_space = spaces.Box(-limit, limit, dtype=np.float32)
+        frame = spaces.Box(0, 255, (layout.image_size, layout.image_size, 3), np.uint8)
+        self.observation_space = spaces.Dict(
+            {
+                "pixels": spaces.Dict({camera: frame for camera in layout.cameras}),
+                "agent_pos": spaces.Box(-np.inf, np.inf, (len(layout.state),), np.float32),
+            }
+        )
+        self._draw, self.world = self.task.make_renderer(), None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+        """Begin the episode of a scene seed; without one, of a random seed."""
+        super().reset(seed=seed)
+        scene_seed = int(self.np_random.integers(2**63)) if seed is None else seed
+        self.world = self.task.begin(scene_seed, None, self.world)
+        return self._observe(), self._info()
+
+    def step(self, action: np.ndarray):
+        task, space = self.task, self.action_space
+        self.task.step([self.world], [np.clip(np.asarray(action, np.float32), space.low, space.high)])
+        truncated = self.world.steps >= self._max_episode_steps
+        reward = float(task.reward(self.world))
+        return self._observe(), reward, task.is_over(self.world), truncated, self._info()
+
+    def render(self) -> np.ndarray | None:
+        """uint8 ``[render_size, render_size, 3]``, or the next smaller multiple of a frame's side."""
+        if self.render_mode is None:
+            return None
+        frame = self._frame[:, : self._frame.shape[0]]
+        times = max(1, self.render_size // len(frame))
+        return frame.repeat(times, 0).repeat(times, 1)
+
+    def _observe(self) -> dict[str, Any]:
+        self._frame, cameras = self._draw(self.world), self.task.layout.cameras
+        frames = np.split(self._frame, len(cameras), axis=1)
+        pixels = {name: np.ascontiguousarray(frame) for name, frame in zip(cameras, frames, strict=True)}
+        return {"pixels": pixels, "agent_pos": np.asarray(self.task.agent_pos(self.world), np.float32)}
+
+    def _info(self) -> dict[str, np.generic]:
+        world = self.world
+        ended = world.steps >= self._max_episode_steps
+        return {
+            "is_success": np.bool_(ended and self.task.is_success(world)),
+            "dropped": np.bool_(world.dropped),
+            "position_error": np.float32(world.position_error),
+        }

@@ -1,0 +1,102 @@
+"""Cells of the grid of MuJoCo tasks, and its table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dynmap_rl.evaluation.protocol import result_rows
+from dynmap_rl.evaluation.statistics import shared_interval, summarize
+from dynmap_rl.utils.files import read_json
+
+from .cells import Cell
+from .tables import join_table
+
+TASKS = "FetchPush", "FetchSlide", "PlateSlide", "Soccer"
+SEEDS = 0, 1, 2  # of weights and batches, of world models and policies
+METHODS = {  # by the row of the table: recipe, its options, and minutes of one core for a seed
+    "Only-RGB": ("decoupled", ("--world_model.supervision", "none"), 25),
+    "RGB+[P]": ("decoupled", ("--world_model.supervision", "position"), 25),
+    "RGB+[P+V]": ("decoupled", ("--world_model.supervision", "position,velocity"), 25),
+    "End-to-End": ("end_to_end", (), 35),
+    "ACT": ("baseline", ("--policy", "act"), 60),
+    "Diffusion Policy": ("baseline", ("--policy", "diffusion"), 60),
+}
+
+
+def list_benchmarks(episodes: int = 500) -> dict[tuple[str, str, int], Cell]:
+    """Return the cells by task, method and seed; each trains from the start and evaluates on ``episodes`` scenes."""
+    cells = {}
+    for task in TASKS:
+        for method, (recipe, options, _) in METHODS.items():
+            for seed in SEEDS:
+                arguments = ["--task", f"mujoco:{task}", *options, "--seeds", str(seed)]
+                arguments += ["--world_model.seed", str(seed)] if recipe == "decoupled" else []
+                arguments += ["--eval.episodes", str(episodes), "--eval.paper_episodes", "0"]
+                cells[task, method, seed] = Cell(name_cell(task, method, seed), recipe, tuple(arguments))
+    return cells
+
+
+def name_cell(task: str, method: str, seed: int) -> str:
+    """Return the name of a cell, its run and its result."""
+    words = method.lower().translate(str.maketrans("-+ ", "___", "[]"))
+    return f"{task.lower()}_{words}_seed_{seed}"
+
+
+def read_benchmarks(results: Path) -> dict[tuple[str, str], list[dict]]:
+    """Read the results by task and method, each a list of the seeds that are there."""
+    found = {}
+    for task, method, seed in list_benchmarks():
+        path = results / f"{name_cell(task, method, seed)}.json"
+        if path.exists():
+            found.setdefault((task, method), []).append(read_json(path))
+    return found
+
+
+def benchmark_rows(results: Path) -> list[dict]:
+    """Return a row for each task and method: SR, PE and DR over the seeds, intervals, and the drops and failures.
+
+    Returns:
+        Dicts with ``task``, ``method``, ``seeds``, ``episodes``, ``SR``, ``SR_interval``, ``DR``, ``DR_interval`` (%),
+        ``PE`` (mm), and ``commands``. Intervals count with start states that the seeds share.
+
+    Raises:
+        ValueError: the seeds of a row were evaluated on different scenes.
+    """
+    table = []
+    for (task, method), cells in read_benchmarks(results).items():
+        rows = [part for cell in cells for part in result_rows(cell)]
+        if len({tuple(row["scene_seed"] for row in part) for part in rows}) > 1:
+            raise ValueError(f"{results} must have the same scenes for all seeds of {method} on {task}")
+        summary = summarize([row for part in rows for row in part])
+        table.append(
+            {
+                "task": task,
+                "method": method,
+                "seeds": len(rows),
+                **{name: summary[name] for name in ("episodes", "SR", "DR", "PE")},
+                "SR_interval": shared_interval(rows),
+                "DR_interval": shared_interval(rows, "dropped"),
+                "commands": [cell["command"] for cell in cells],
+            }
+        )
+    return table
+
+
+def benchmark_table(rows: list[dict]) -> str:
+    """Return the table in Markdown: a line for each method, a column for each task; empty where there is no result."""
+    cells = {(row["task"], row["method"]): row for row in rows}
+    lines = []
+    for method in METHODS:
+        line = [method]
+        for task in TASKS:
+            row = cells.get((task, method))
+            line.append(_describe(row) if row else "")
+        lines.append(line)
+    return join_table(["success %", *TASKS], lines)
+
+
+def _describe(row: dict) -> str:
+    low, high = row["SR_interval"]
+    text = f"**{row['SR']:.1f}** [{low:.1f}, {high:.1f}]"
+    text += f", off the table {row['DR']:.1f}" if row["DR"] else ""
+    return text + (f" ({row['seeds']} of {len(SEEDS)} seeds)" if row["seeds"] < len(SEEDS) else "")

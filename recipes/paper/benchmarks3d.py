@@ -1,0 +1,106 @@
+"""Run the grid of the MuJoCo tasks: world models, end-to-end training, ACT and Diffusion Policy; write the table.
+
+    python recipes/paper/benchmarks3d.py --dry_run                    # cells, those that are complete, remaining time
+    python recipes/paper/benchmarks3d.py --only plateslide --workers 2
+    python recipes/paper/benchmarks3d.py --results runs/benchmarks3d_results     # a grid of your own
+    python recipes/paper/benchmarks3d.py --write                      # the table from the results alone
+
+A cell is a run of another recipe for one task, method and seed, and its result a JSON file; cells with a result are skipped.
+The same command resumes a stopped grid, and every cell. Needs pip install '.[lerobot,mujoco]'.
+"""
+
+import json
+import sys
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from dynmap_rl.utils.cli import run_recipe
+from dynmap_rl.utils.settings import check_at_least
+
+RECIPES = Path(__file__).parents[1]
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of the recipe."""
+
+    # Folder of the cells' results; by default that of the repository.
+    results: Path = RECIPES / "results/benchmarks3d"
+    # Folder of the cells' runs.
+    runs: Path = Path("runs/benchmarks3d")
+    # Cells to run: a part of their names.
+    only: str = ""
+    # Scenes of an evaluation.
+    episodes: int = 500
+    # Cells at a time on this machine; each takes two cores if it is alone, otherwise one.
+    workers: int = 1
+    # Folder with a settings file RECIPE.yaml for any of the recipes, passed to their cells as --config_path.
+    presets: Path | None = None
+    # List the cells and stop.
+    dry_run: bool = False
+    # Write README.md and table.json in the folder of the results from the results alone, and stop.
+    write: bool = False
+
+    def __post_init__(self):
+        check_at_least(self, 1, "workers", "episodes")
+        if self.presets and not self.presets.is_dir():
+            raise ValueError(f"--presets must be a folder, got {self.presets}")
+
+
+def main(config: Config) -> None:
+    """Run the cells without a result, and write the table."""
+    from dynmap_rl.paper.benchmarks import METHODS, list_benchmarks
+    from dynmap_rl.paper.launch import is_done, launch, run_cell
+
+    if config.write:
+        return write(config)
+    cells = {key: c for key, c in list_benchmarks(config.episodes).items() if config.only in c.name}
+    if not cells:
+        raise ValueError(f"--only must be a part of a cell's name, got {config.only!r}; see --dry_run")
+    todo = {key: cell for key, cell in cells.items() if not is_done(cell.name, config.results)}
+    if config.dry_run:
+        minutes = {key: METHODS[key[1]][2] for key in cells}
+        for key, cell in cells.items():
+            print(f"{f'{minutes[key]:3} min' if key in todo else '   done'}  {cell.name}")
+        hours = sum(minutes[key] for key in todo) / 60
+        done = len(cells) - len(todo)
+        print(f"{done} of {len(cells)} cells are complete; about {hours:.1f} hours of one core are left")
+        return None
+    from dynmap_rl.training.dataset import find_or_record
+
+    for task in sorted({cell.task for cell in todo.values()}):  # cells must not record at the same time
+        find_or_record(task)
+    run = partial(
+        run_cell, recipes=RECIPES, results=config.results, runs=config.runs,
+        threads=2 if config.workers == 1 else 1, presets=config.presets, root=Path.cwd(),
+    )  # fmt: skip
+    failed = launch(list(todo.values()), run, workers=config.workers)
+    write(config)
+    if failed:
+        raise ValueError("; ".join(failed))
+    return None
+
+
+def write(config: Config) -> None:
+    """Write ``README.md`` and ``table.json`` from the results, and print the table."""
+    from dynmap_rl.paper.benchmarks import benchmark_rows, benchmark_table
+    from dynmap_rl.utils.files import write_bytes
+
+    rows = benchmark_rows(config.results)
+    if not rows:
+        raise ValueError(f"{config.results} must have results; run recipes/paper/benchmarks3d.py first")
+    table = benchmark_table(rows)
+    commands = "\n".join(command for row in rows for command in row["commands"])
+    page = (
+        "# MuJoCo tasks\n\nSuccess in % with 95 % intervals over three seeds of weights, which share their start states; "
+        "tasks, cameras and experts are described in `dynmap_rl/envs/mujoco/README.md`. Written by "
+        f"`recipes/paper/benchmarks3d.py --write`.\n\n{table}\n\n```bash\n{commands}\n```\n"
+    )
+    write_bytes(config.results / "README.md", page.encode())
+    write_bytes(config.results / "table.json", json.dumps(rows, indent=1).encode())
+    print(f"{table}\nwritten: {config.results / 'README.md'}, {config.results / 'table.json'}")
+
+
+if __name__ == "__main__":
+    run_recipe(main, Config, sys.argv)

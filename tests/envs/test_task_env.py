@@ -1,0 +1,48 @@
+"""Any task as a Gymnasium environment: spaces, seeds, success, and agreement with the TorchRL environment."""
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from own_task import own_task  # noqa: F401
+
+from dynmap_rl.envs.task_env import TaskEnv
+from dynmap_rl.envs.tasks import get_task
+from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
+from dynmap_rl.keys import GYMNASIUM_TASK
+
+
+@pytest.mark.filterwarnings("ignore:.*infinity:UserWarning")
+@pytest.mark.filterwarnings("ignore:.*A Box observation space:UserWarning")
+def test_it_fits_gymnasium(own_task):  # noqa: F811
+    check_env(TaskEnv(f"{own_task}:cameras=2"), skip_render_check=True)
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_episodes_are_those_of_the_torchrl_environment(own_task, flat):  # noqa: F811
+    name = "balance_reaching" if flat else f"{own_task}:cameras=2"
+    env = gymnasium.make(GYMNASIUM_TASK, task=name, disable_env_checker=True)
+    batched = DynmapBatchedEnv(name, 1, from_pixels=True)
+    td, (observation, _) = batched.reset(scene_seed=torch.tensor([5])), env.reset(seed=5)
+    for t in range(8):
+        frames = np.concatenate(list(observation["pixels"].values()), 1)
+        assert (frames == td["pixels"][0].permute(1, 2, 0).numpy()).all()
+        assert (observation["agent_pos"] == td["agent_pos"][0].numpy()).all()
+        action = 0.5 * batched.action_spec.high * (t > 2)
+        td = batched.step(td.set("action", action))["next"]
+        observation, reward, *_ = env.step(action[0].numpy())
+        assert reward == pytest.approx(td["reward"].item(), abs=1e-6)
+
+
+def test_success_is_reported_in_the_last_step_alone(own_task):  # noqa: F811
+    env = TaskEnv(own_task, render_mode="rgb_array")
+    env.reset(seed=0)
+    act, ends = get_task(own_task).demonstrator(env.world), []
+    for _ in range(env._max_episode_steps):
+        *_, terminated, truncated, info = env.step(act())
+        ends.append((terminated, truncated, bool(info["is_success"])))
+    assert ends[-1] == (False, True, True) and set(ends[:-1]) == {(False, False, False)}
+    assert env.render().shape == (256, 256, 3) and env.metadata["render_fps"] == 20
+    with pytest.raises(ValueError, match="render_mode"):
+        TaskEnv(own_task, render_mode="human")
