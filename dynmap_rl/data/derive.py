@@ -194,7 +194,8 @@ def choose_view(
     """
     if objects is not None and source == "centroid":
         raise ValueError("--objects has no effect with --source centroid; leave it out")
-    objects = objects or (len(BODIES) // 3 if meta and source != "centroid" else 1)
+    if objects is None:
+        objects = len(BODIES) // 3 if meta and source != "centroid" else 1
     if objects < 1 or not 0 < threshold < 256:
         raise ValueError(
             f"--objects must be at least 1 and --threshold 1 to 255, got {objects} and {threshold}"

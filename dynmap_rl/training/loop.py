@@ -56,7 +56,7 @@ def fit(
     model.to(memory_format=torch.channels_last)  # with bfloat16 six times faster on a CPU
     optimizer = make_optimizer(model, settings.learning_rate, weight_decay=1e-4)
     episodes = episodes.select(
-        "pixels", "action", "goal", "dynamics", "disturbed", "expert_action", strict=False
+        "pixels", "action", "goal", "dynamics", "disturbed", "expert_action", "labelled", strict=False
     ).to(device)
     generator = torch.Generator(device).manual_seed(1000 * seed)
     loss_module = make_loss(generator)

@@ -17,6 +17,7 @@ from dynmap_rl.keys import DYNAMICS
 from dynmap_rl.modules.checkpoints import make_world_model
 from dynmap_rl.objectives.world_model import WorldModelLoss
 from dynmap_rl.utils.cli import parse_settings, read_arguments
+from dynmap_rl.utils.files import read_json
 
 SMALL = {
     "control_step": {},
@@ -117,6 +118,19 @@ def test_commands_of_other_scripts_are_understood(load):
     for recipe, arguments in [*load("memory").COMMANDS.items(), *listed]:
         config_class = importlib.import_module(f"recipes.{recipe.replace('/', '.')}").Config
         parse_settings(config_class, read_arguments(arguments, config_class))
+
+
+@pytest.mark.slow
+def test_errors_of_derived_dynamics_grow_with_noise(load, recording, tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        "sys.argv",
+        ["x.py", "--datasets", str(recording), "--episodes", "2", "--output", str(tmp_path / "found.json")],
+    )
+    load("derivatives").main()
+    found = read_json(tmp_path / "found.json")[recording.name]
+    errors = [found["state"][f"savgol, {noise} mm"]["velocity"]["linear"] for noise in (0, 2, 5, 10)]
+    assert errors == sorted(errors) and found["state"]["central, 0 mm"]["position"]["linear"] == 0
+    assert found["frames"]["tracks, savgol"]["position"]["linear"] < 15 and found["episodes"] == 2
 
 
 @pytest.mark.slow
