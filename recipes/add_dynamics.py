@@ -66,8 +66,9 @@ class Config:
 def main(config: Config) -> None:
     """Derive the columns and report."""
     from dynmap_rl.data.derive import add_dynamics, parse_entries
-    from dynmap_rl.data.quality import quality_text
+    from dynmap_rl.data.quality import quality_text, worst_episode
     from dynmap_rl.reporting.dataset_page import write_dataset_page
+    from dynmap_rl.reporting.track_figure import plot_tracks
     from dynmap_rl.runs.folder import plain_settings
     from dynmap_rl.utils.files import write_json
 
@@ -97,6 +98,9 @@ def main(config: Config) -> None:
     command = command_line(sys.argv)
     differences = {q: difference.tolist() for q, difference in found["differences"].items()}
     write_json(folder / "quality.json", found["quality"] | {"differences": differences, "command": command})
+    (folder / "tracks.png").unlink(missing_ok=True)  # of another source
+    if config.source in ("tracks", "flow"):
+        plot_tracks(config.dataset, found["view"], worst_episode(found["quality"]), folder / "tracks.png")
     write_dataset_page(folder, config.output, plain_settings(config), command, text)
 
 

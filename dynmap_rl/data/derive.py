@@ -15,12 +15,10 @@ from dynmap_rl.keys import DYNAMICS
 
 from .demonstrations import META, find_layout, find_meta
 from .format.columns import write_columns
-from .format.frames import choose_camera
 from .format.reading import find_dataset, read_column, read_info, read_table, spans
 from .normalization import planar_range, value_range
 from .quality import Derived, judge_quality
-from .sources import SOURCES, Camera, Motion, read_motion
-from .tracking import SORTS
+from .sources import SOURCES, Motion, choose_view, read_motion
 
 METHODS = ("central", "savgol")
 
@@ -123,8 +121,8 @@ def add_dynamics(
         replace: replace existing dynamics columns.
 
     Returns:
-        ``differences``, the mean absolute difference from replaced columns, ``[D]`` by quantity, and ``quality`` (see
-        :func:`dynmap_rl.data.quality.judge_quality`).
+        ``differences``, the mean absolute difference from replaced columns, ``[D]`` by quantity; ``quality`` (see
+        :func:`dynmap_rl.data.quality.judge_quality`); and ``view``, the camera with all defaults, None for a state.
 
     Raises:
         ValueError: an argument is wrong, or the dataset is damaged or does not allow it.
@@ -145,13 +143,12 @@ def add_dynamics(
         if noise < 0 or angle_noise < 0:
             raise ValueError(f"--noise and --angle_noise must be at least 0, got {noise} and {angle_noise}")
         columns = _check_columns(root, info, state, columns, angles)
-        names = [entry_names(info, state)[i] for i in columns]
+        names, view = [entry_names(info, state)[i] for i in columns], None
         angles = [columns.index(i) for i in angles]
-        motions = _read_state(root, info, state, columns, angles, (noise, angle_noise, noise_seed))
+        motions = _read_state(root, info, state, columns, angles, period, (noise, angle_noise, noise_seed))
     else:
-        view = choose_view(
-            root, info, meta if planar else None, source, camera, objects, threshold, sort, width
-        )
+        frames = {"camera": camera, "objects": objects, "threshold": threshold, "sort": sort, "width": width}
+        view = choose_view(root, info, source, planar, **frames)
         names, motions = view.names, read_motion(root, info, view)
         if planar and view.objects == len(BODIES) // 3 and source != "centroid":
             names = list(BODIES)
@@ -161,7 +158,7 @@ def add_dynamics(
     values, derived = {q: np.empty((len(table), len(names))) for q in DYNAMICS}, []
     for episode, motion in motions:
         own = motion.position
-        own[:, motion.angles] = np.unwrap(own[:, motion.angles], axis=0, period=period)
+        own[:, motion.angles] = np.unwrap(own[:, motion.angles], axis=0, period=motion.period)
         try:
             velocity, acceleration = differentiate(own, time[rows[episode]], method, window, order)
             if motion.velocity is not None:
@@ -181,35 +178,17 @@ def add_dynamics(
         if f"dynamics.{q}" in old
     }
     differences = {q: np.abs(values[q] - v).mean(0) for q, v in there.items() if v.shape == values[q].shape}
-    return {"differences": differences, "quality": judge_quality(derived, names)}
-
-
-def choose_view(
-    root: Path, info: dict, meta: dict | None, source: str, camera, objects, threshold, sort, width
-) -> Camera:
-    """Return how frames are read, with the defaults of a recording in the plane if its ``meta`` is given.
-
-    Raises:
-        ValueError: an argument is wrong.
-    """
-    if objects is not None and source == "centroid":
-        raise ValueError("--objects has no effect with --source centroid; leave it out")
-    if objects is None:
-        objects = len(BODIES) // 3 if meta and source != "centroid" else 1
-    if objects < 1 or not 0 < threshold < 256:
-        raise ValueError(
-            f"--objects must be at least 1 and --threshold 1 to 255, got {objects} and {threshold}"
-        )
-    if sort not in SORTS:
-        raise ValueError(f"--sort must be one of {', '.join(SORTS)}, got {sort!r}")
-    width = 1.0 if width is None and meta else width
-    if width is not None and width <= 0:
-        raise ValueError(f"--width must be above 0, got {width}")
-    return Camera(source, choose_camera(root, info, camera), objects, threshold, sort, width)
+    return {"differences": differences, "quality": judge_quality(derived, names), "view": view}
 
 
 def _read_state(
-    root: Path, info: dict, state: str, columns: list[int], angles: list[int], noise: tuple[float, float, int]
+    root: Path,
+    info: dict,
+    state: str,
+    columns: list[int],
+    angles: list[int],
+    period: float,
+    noise: tuple[float, float, int],
 ) -> Iterator[tuple[int, Motion]]:
     """Iterate over the episodes' positions in a column, with noise on lengths and angles."""
     table = read_table(root, info, [state])
@@ -218,7 +197,7 @@ def _read_state(
     scale = np.where(np.isin(np.arange(len(columns)), angles), sizes[1], sizes[0])
     position += scale * np.random.default_rng(seed).standard_normal(position.shape)
     for episode, rows in spans(table["episode_index"].to_numpy()):
-        yield episode, Motion(position[rows], angles)
+        yield episode, Motion(position[rows], angles, period)
 
 
 def _describe(

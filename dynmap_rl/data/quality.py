@@ -52,7 +52,7 @@ LIMITS = {
     ),
     "agreement": (
         0.7, False, "correlation of the tracks' velocity with that of the optical flow",
-        "look at the film of the tracks; velocities are not reliable",
+        "look at the picture of the tracks; velocities are not reliable",
     ),
 }  # fmt: skip
 
@@ -139,7 +139,7 @@ def _measure(episode: Derived, names: Sequence[str]) -> dict[str, dict[str, floa
     rms = np.sqrt(np.square(rest).mean(0))
     result = {
         "residual": {names[i]: rms[i] / extent for i in lines},
-        "residual_angle": {names[i]: rms[i] for i in motion.angles},
+        "residual_angle": {names[i]: rms[i] * 2 * np.pi / motion.period for i in motion.angles},
         "jumps": {names[i]: _jumps(position[:, i], extent) for i in lines},
     }
     if motion.found is not None:
@@ -187,3 +187,14 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
     """Return the correlation of two velocities ``[T, 2]`` about 0; 1 where neither is anything but 0."""
     norm = np.sqrt(np.square(a).sum() * np.square(b).sum())
     return float((a * b).sum() / norm) if norm else 1.0
+
+
+def worst_episode(quality: dict) -> int:
+    """Return the episode in which the check that is farthest beyond its limit, or nearest to it, is worst."""
+
+    def excess(item: tuple[str, dict]) -> float:
+        name, check = item
+        ratio = check["value"] / check["limit"]
+        return ratio if LIMITS[name][1] else 2 - ratio
+
+    return max(quality["checks"].items(), key=excess)[1]["episode"]

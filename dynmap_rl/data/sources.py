@@ -8,9 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from dynmap_rl.envs.task import BODIES
+
 from .flow import flow_velocity
-from .format.frames import iterate_frames
-from .tracking import WIDEST, Tracks, track_centroid, track_objects
+from .format.frames import choose_camera, iterate_frames
+from .tracking import SORTS, WIDEST, Tracks, track_centroid, track_objects
 
 SOURCES = "state", "centroid", "tracks", "flow"
 BODY = "x", "y", "theta"
@@ -23,6 +25,7 @@ class Motion:
     Attributes:
         position: ``[T, D]``, float64.
         angles: entries that are angles.
+        period: period of the angles: 2 pi for radians, 360 for degrees.
         velocity: ``[T, D]`` per s, where the source measures it itself; None is to be derived.
         other: a second measurement of the velocity ``[T, D]`` that was not used, for comparison, or None.
         found: bool ``[T, N]``, whether each object was found in the frame; None for a state.
@@ -31,6 +34,7 @@ class Motion:
 
     position: np.ndarray
     angles: list[int]
+    period: float = 2 * np.pi
     velocity: np.ndarray | None = None
     other: np.ndarray | None = None
     found: np.ndarray | None = None
@@ -70,6 +74,50 @@ class Camera:
         if self.source == "centroid":
             return ["x", "y"]
         return [f"object{n}_{name}" for n in range(1, self.objects + 1) for name in BODY]
+
+
+def choose_view(
+    root: Path,
+    info: dict,
+    source: str,
+    planar: bool = False,
+    *,
+    camera: str | None = None,
+    objects: int | None = None,
+    threshold: int = 30,
+    sort: str = "lowest",
+    width: float | None = None,
+) -> Camera:
+    """Return how frames are read.
+
+    Args:
+        root: folder of the dataset, for messages.
+        info: content of its ``meta/info.json``.
+        source: ``centroid``, ``tracks`` or ``flow``.
+        planar: whether the dataset is a recording of cart and block, whose picture is 1 m wide and shows two objects.
+        camera: the camera's column; by default the first one.
+        objects: see :class:`Camera`, also for the next; by default two for a planar recording, otherwise one.
+        threshold: smallest difference of a pixel that moves.
+        sort: order of the objects.
+        width: width of the picture (m); by default 1 for a planar recording, otherwise None.
+
+    Raises:
+        ValueError: an argument is wrong.
+    """
+    if objects is not None and source == "centroid":
+        raise ValueError("--objects has no effect with --source centroid; leave it out")
+    if objects is None:
+        objects = len(BODIES) // 3 if planar and source != "centroid" else 1
+    if objects < 1 or not 0 < threshold < 256:
+        raise ValueError(
+            f"--objects must be at least 1 and --threshold 1 to 255, got {objects} and {threshold}"
+        )
+    if sort not in SORTS:
+        raise ValueError(f"--sort must be one of {', '.join(SORTS)}, got {sort!r}")
+    width = 1.0 if width is None and planar else width
+    if width is not None and width <= 0:
+        raise ValueError(f"--width must be above 0, got {width}")
+    return Camera(source, choose_camera(root, info, camera), objects, threshold, sort, width)
 
 
 def read_motion(root: Path, info: dict, camera: Camera) -> Iterator[tuple[int, Motion]]:

@@ -19,10 +19,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dynmap_rl.data.demonstrations import load_dataset, load_meta
-from dynmap_rl.data.derive import choose_view, differentiate
+from dynmap_rl.data.demonstrations import load_dataset
+from dynmap_rl.data.derive import differentiate
 from dynmap_rl.data.format.reading import read_info
-from dynmap_rl.data.sources import read_motion
+from dynmap_rl.data.sources import choose_view, read_motion
 from dynmap_rl.envs.world import CONTROL_DT
 from dynmap_rl.keys import DYNAMICS
 from dynmap_rl.utils.files import write_json
@@ -68,10 +68,10 @@ def from_state(truth: Dynamics) -> dict[str, dict]:
 
 def from_frames(root: Path, truth: Dynamics) -> dict[str, dict]:
     """Errors of tracks by every method, and of flow; the centroid against the cart, less the best constant offset."""
-    info, meta = read_info(root), load_meta(root)
+    info = read_info(root)
     motions = {}
     for source in ("flow", "centroid"):
-        view = choose_view(root, info, meta, source, None, None, 30, "lowest", None)
+        view = choose_view(root, info, source, planar=True)
         motions[source] = [
             motion for _, motion in islice(read_motion(root, info, view), len(truth["position"]))
         ]

@@ -7,7 +7,7 @@ from robot_dataset import make_robot_dataset
 
 from dynmap_rl.data.derive import differentiate
 from dynmap_rl.data.format.reading import read_info
-from dynmap_rl.data.quality import LIMITS, Derived, judge_quality, quality_text
+from dynmap_rl.data.quality import LIMITS, Derived, judge_quality, quality_text, worst_episode
 from dynmap_rl.data.sources import Camera, Motion, measure, read_motion
 
 NAMES = ["low_x", "low_y", "low_theta", "high_x", "high_y", "high_theta"]
@@ -57,7 +57,7 @@ def test_a_fault_of_a_film_is_found_with_its_place(fault):
         assert bad == set() and quality["verdict"] == "good"
         return
     assert fault in bad and quality["verdict"] == "doubtful"
-    assert quality["checks"][fault]["episode"] == 7
+    assert quality["checks"][fault]["episode"] == worst_episode(quality) == 7
     assert LIMITS[fault][3] in quality_text(quality)
     if fault == "lost":
         assert quality["checks"]["lost"]["where"] == "high"
@@ -87,6 +87,21 @@ def test_a_fault_of_positions_is_found(name, change):
     good, bad = judge_state(position), judge_state(change(position))
     assert set(good) == {"jumps", "residual", "residual_angle"}, "a state has no frames"
     assert all(check["good"] for check in good.values()) and not bad[name]["good"]
+
+
+def test_angles_in_degrees_are_judged_like_those_in_radians():
+    noisy = POSES.reshape(120, 6) + 0.2 * np.random.default_rng(0).standard_normal((120, 6)) * [
+        0,
+        0,
+        1,
+        0,
+        0,
+        1,
+    ]
+    degrees = noisy * np.tile([1, 1, 180 / np.pi], 2)
+    motions = Motion(noisy, [2, 5]), Motion(degrees, [2, 5], 360)
+    found = [judge_quality([Derived(0, m.position, m.position, m)], NAMES)["checks"] for m in motions]
+    assert found[0]["residual_angle"]["value"] == pytest.approx(found[1]["residual_angle"]["value"])
 
 
 def test_noise_of_positions_is_measured():

@@ -191,7 +191,8 @@ def test_tracks_of_a_recording_are_in_its_units_and_it_stays_a_recording(recordi
     assert after["normalization"]["action"] == before["normalization"]["action"]
     quality = json.loads((folder_of_runs / "tracks/quality.json").read_text())
     assert quality["checks"]["agreement"]["good"] and quality["command"]
-    assert f"derived columns: {quality['verdict']}" in (folder_of_runs / "tracks/report.html").read_text()
+    page = (folder_of_runs / "tracks/report.html").read_text()
+    assert f"derived columns: {quality['verdict']}" in page and page.count("data:image/") == 3
 
 
 @pytest.mark.parametrize(
