@@ -17,6 +17,7 @@ WIDEST = 160  # pixels that frames are reduced to, as the centroid is finer than
 BINS = 16  # levels of a colour channel in histograms
 SPARE = 3  # colours besides those of the objects: shadows, edges, and places that were taken for background
 FAINTEST = 0.3  # share of the usual area from which on an object counts as found
+RAREST = 0.1  # share of the frames in which a colour must be seen to be that of an object
 SORTS = "lowest", "largest", "brightest"
 
 
@@ -82,8 +83,8 @@ def track_objects(frames: np.ndarray, objects: int = 1, threshold: int = 30, sor
     A pixel belongs to what moves if its colour is more frequent among pixels that differ from the background than
     among pixels that never do. So an object is found where it rests, and its place in the background is not taken
     for an object. Several objects are told apart by their colours (k-means over the episode; colours that differ by less
-    than ``threshold`` are one); colours that are seen in less than half of the frames, or that move less, are left out. The object is the largest connected region of
-    its colour; centre and angle are its moments.
+    than ``threshold`` are one). Colours that are seen in less than a tenth of the frames, or that move less, are left
+    out. The object is the largest connected region of its colour; centre and angle are its moments.
 
     An object of several colours needs ``objects`` = 1, and objects of one colour are not told apart. The angle is
     that of the longest axis, or of the shortest one if that is nearer to the horizontal in the first frame. It means
@@ -109,7 +110,7 @@ def track_objects(frames: np.ndarray, objects: int = 1, threshold: int = 30, sor
     labels = _split(frames, _moving(frames, changed, ever), objects, threshold)
     regions = [[_measure(frame_labels == n) for n in range(1, objects + 1)] for frame_labels in labels]
     area = np.array([[region[1] for region in row] for row in regions], float)
-    found = area >= np.maximum(4, FAINTEST * np.median(area, axis=0))
+    found = area >= np.array([_faintest(column) for column in area.T])
     if not found.any(0).all():
         raise ValueError(f"must have {objects} objects that move, got fewer; use fewer --objects")
     pose = np.array([[region[0] for region in row] for row in regions])
@@ -191,12 +192,17 @@ def _merge(centers: np.ndarray, threshold: int) -> np.ndarray:
 def _motion(masks: np.ndarray) -> float:
     """Return how much a colour moves: the spread of its centre times the root of its area, 0 for a rare colour."""
     area = masks.sum((1, 2))
-    seen = area >= max(4, FAINTEST * np.median(area))
-    if seen.mean() < 0.5:
+    seen = area >= _faintest(area)
+    if seen.mean() < RAREST:
         return 0.0
     centers = np.array([np.argwhere(mask).mean(0) for mask in masks[seen]])
     spread = np.linalg.norm(np.quantile(centers, 0.95, axis=0) - np.quantile(centers, 0.05, axis=0))
     return float(spread * np.sqrt(np.median(area[seen])))
+
+
+def _faintest(area: np.ndarray) -> float:
+    """Return the area from which on an object counts as found, given its area in all frames."""
+    return max(4.0, FAINTEST * float(np.median(area[area > 0]))) if area.any() else np.inf
 
 
 def _measure(mask: np.ndarray) -> tuple[tuple[float, float, float], int, bool]:

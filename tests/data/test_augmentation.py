@@ -134,3 +134,14 @@ def test_distractors_leave_the_rest_and_the_input_alone(windows):
     assert (out.exclude("pixels") == windows.exclude("pixels")).all()
     out["pixels"].zero_()
     assert (windows == before).all()
+
+
+@pytest.mark.parametrize("size", [2, 3])
+def test_a_point_and_a_single_body_change_like_the_first_of_two_bodies(size):
+    episodes = make_episodes()
+    few = episodes.clone()
+    few["dynamics"] = few["dynamics"].apply(lambda x: x[..., :size])
+    out, expected = (augment(td, torch.Generator().manual_seed(2)) for td in (few, episodes))
+    for quantity, values in out["dynamics"].items():
+        assert torch.equal(values, expected["dynamics", quantity][..., :size])
+    assert not torch.equal(out["dynamics", "position"], few["dynamics", "position"])

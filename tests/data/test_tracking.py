@@ -55,6 +55,13 @@ def test_an_object_that_is_hidden_is_interpolated():
     assert np.abs(tracks.pose - truth(poses))[hidden, :, :2].max() < 3
 
 
+def test_an_object_that_leaves_for_most_of_the_film_is_still_an_object():
+    poses = make_poses()
+    frames = np.concatenate([film(poses[:24], SIZE), film(poses[24:], SIZE, bodies=[0])])
+    tracks = track_objects(frames, 2)
+    assert tracks.found[:, 0].all() and np.array_equal(tracks.found[:, 1], np.arange(60) < 24)
+
+
 def test_the_order_of_the_objects_is_the_chosen_one():
     frames = film(make_poses(), SIZE, colors=((60, 20, 20), (120, 120, 200)))
     heights = {sort: track_objects(frames, 2, sort=sort).pose[0, :, 1] for sort in ("lowest", "brightest")}
