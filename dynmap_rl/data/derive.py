@@ -162,6 +162,7 @@ def add_dynamics(
         try:
             velocity, acceleration = differentiate(own, time[rows[episode]], method, window, order)
             if motion.velocity is not None:
+                motion = dataclasses.replace(motion, other=velocity)
                 velocity = motion.velocity
                 acceleration = differentiate(velocity, time[rows[episode]], method, window, order)[0]
         except ValueError as error:

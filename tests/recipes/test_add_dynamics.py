@@ -189,8 +189,12 @@ def test_tracks_of_a_recording_are_in_its_units_and_it_stays_a_recording(recordi
     before, after = load_meta(recording), load_meta(tmp_path / "tracks")
     assert after["episodes"] == before["episodes"] and "layout" not in after
     assert after["normalization"]["action"] == before["normalization"]["action"]
-    quality = json.loads((folder_of_runs / "tracks/quality.json").read_text())
+    flow, quality = (
+        json.loads((folder_of_runs / source / "quality.json").read_text()) for source in ("flow", "tracks")
+    )
     assert quality["checks"]["agreement"]["good"] and quality["command"]
+    agreement = pytest.approx(quality["checks"]["agreement"]["value"])
+    assert flow["checks"]["agreement"]["value"] == agreement, "the same two velocities"
     page = (folder_of_runs / "tracks/report.html").read_text()
     assert f"derived columns: {quality['verdict']}" in page and page.count("data:image/") == 3
 
