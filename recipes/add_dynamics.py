@@ -1,11 +1,13 @@
 """Add dynamics columns to any LeRobot v3.0 dataset, derived from its state or tracked in its frames.
 
     python recipes/add_dynamics.py --dataset user/name --columns 0,1,2 --angles 2 --output datasets/name
-    python recipes/add_dynamics.py --dataset user/name --track --output datasets/name
+    python recipes/add_dynamics.py --dataset user/name --source tracks --objects 2 --output datasets/name
+    python recipes/add_dynamics.py --dataset datasets/balance_reaching --source tracks --replace --output datasets/tracks
 
 World models are supervised on the columns dynamics.position, .velocity and .acceleration (see recipes/robot.py). The
-dataset is copied and stays as it is; the copy appears when it is complete. The page report.html in runs/add_dynamics
-shows the columns.
+dataset is copied and stays as it is; the copy appears when it is complete. The copy of a recording of a task can be
+trained on with recipes/decoupled.py. The page report.html in runs/add_dynamics says how good the columns are likely to
+be, and shows them.
 """
 
 import sys
@@ -23,6 +25,9 @@ class Config:
     dataset: str | None = None
     # Folder of the new dataset. Required.
     output: Path | None = None
+    # Source of the positions: state (a column), or the frames: centroid (of all that moves), tracks (objects with angles)
+    # or flow (tracks, with velocities by optical flow). Limits: dynmap_rl/data/README.md.
+    source: str = "state"
     # Column whose entries are positions.
     state: str = "observation.state"
     # Entries of that column to take, such as 0,1,2; by default all.
@@ -31,18 +36,29 @@ class Config:
     angles: str | None = None
     # Period of the angles: 6.2832 (rad) or 360 (degrees).
     period: float = 6.283185307179586
-    # Derivatives: central (differences over both neighbours) or savgol (for noisy positions at even timestamps).
-    method: str = "central"
+    # Standard deviation of noise that is added to the positions of a state, for experiments, in their unit.
+    noise: float = 0.0
+    # Standard deviation of noise that is added to the angles of a state.
+    angle_noise: float = 0.0
+    # Seed of the noise.
+    noise_seed: int = 0
+    # Derivatives: central (differences over both neighbours) or savgol (for noisy positions at even timestamps); by
+    # default central for a state and savgol for frames.
+    method: str | None = None
     # Steps of savgol's window.
     window: int = 11
     # Order of savgol's polynomial.
     order: int = 3
-    # Take positions from the frames instead: the centroid of what moves, in pixels (limits: dynmap_rl/data/README.md).
-    track: bool = False
-    # Camera's column for --track; by default the first camera.
+    # Camera's column, for sources of frames; by default the first camera.
     camera: str | None = None
-    # Difference of a colour channel, 0 to 255, from which on a pixel counts as moving, for --track.
+    # Number of objects, for tracks and flow; by default two for a recording of cart and block, otherwise one.
+    objects: int | None = None
+    # Difference of a colour channel, 0 to 255, from which on a pixel counts as moving.
     threshold: int = 30
+    # Order of the objects: lowest (at first), largest or brightest one first; it must be the same in all episodes.
+    sort: str = "lowest"
+    # Width of the picture in m; by default 1 for a recording of cart and block, otherwise positions are in pixels.
+    width: float | None = None
     # Replace existing dynamics columns, and print how far the new ones differ.
     replace: bool = False
 
@@ -50,29 +66,42 @@ class Config:
 def main(config: Config) -> None:
     """Derive the columns and report."""
     from dynmap_rl.data.derive import add_dynamics, parse_entries
+    from dynmap_rl.data.quality import quality_text, worst_episode
     from dynmap_rl.reporting.dataset_page import write_dataset_page
+    from dynmap_rl.reporting.track_figure import plot_tracks
     from dynmap_rl.runs.folder import plain_settings
+    from dynmap_rl.utils.files import write_json
 
     if not config.dataset or not config.output:
         raise ValueError("--dataset and --output must be given: the dataset, and the folder of the new one")
-    if config.track:
-        refuse(config, Config(), ("state", "columns", "angles", "period"), "--track")
+    if config.source == "state":
+        names, other = ("camera", "objects", "threshold", "sort", "width"), "--source state"
     else:
-        refuse(config, Config(), ("camera", "threshold"), "positions of a state; add --track")
+        names, other = (
+            ("state", "columns", "angles", "period", "noise", "angle_noise"),
+            f"--source {config.source}",
+        )
+    refuse(config, Config(), names, other)
     settings = vars(config) | {
         "columns": parse_entries(config.columns, "--columns"),
         "angles": parse_entries(config.angles, "--angles") or [],
     }
-    differences = add_dynamics(**settings)
+    found = add_dynamics(**settings)
     print(f"written: {config.output}")
     lines = []
-    for quantity, difference in differences.items():
+    for quantity, difference in found["differences"].items():
         entries = ", ".join(f"{value:.3g}" for value in difference)
-        lines.append(f"  mean absolute difference from the replaced {quantity}: {entries}")
-        print(lines[-1])
+        lines.append(f"mean absolute difference from the replaced {quantity}: {entries}")
+    text = "\n".join([quality_text(found["quality"]), *lines])
+    print(text)
     folder = Path("runs/add_dynamics") / config.output.name
     command = command_line(sys.argv)
-    write_dataset_page(folder, config.output, plain_settings(config), command, "\n".join(lines))
+    differences = {q: difference.tolist() for q, difference in found["differences"].items()}
+    write_json(folder / "quality.json", found["quality"] | {"differences": differences, "command": command})
+    (folder / "tracks.png").unlink(missing_ok=True)  # of another source
+    if config.source in ("tracks", "flow"):
+        plot_tracks(config.dataset, found["view"], worst_episode(found["quality"]), folder / "tracks.png")
+    write_dataset_page(folder, config.output, plain_settings(config), command, text)
 
 
 if __name__ == "__main__":

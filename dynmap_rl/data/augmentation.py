@@ -23,7 +23,7 @@ def augment(
 
     Args:
         windows: ``[B, T]`` with ``pixels``, ``action`` ``[B, T, 3]``, ``goal`` ``[B, T, 2]`` and ``dynamics``
-            ``[B, T, 6]``, in SI units.
+            ``[B, T, D]``: x, y and theta of one body after the other, or x and y of a point, in SI units.
         generator: source of the random numbers, on the device of the windows.
         max_shift: largest shift along either axis, in pixels.
         mirror: mirror every other window, on average.
@@ -52,8 +52,9 @@ def augment(
         if key in windows:
             windows[key] = windows[key] * sign
     windows["goal"] = windows["goal"] * sign[..., :2] + offset[..., :2]
-    dynamics = windows["dynamics"].apply(lambda x: x * sign.repeat(1, 1, 2))
-    windows["dynamics"] = dynamics.set("position", dynamics["position"] + offset.repeat(1, 1, 2))
+    entries = torch.arange(windows["dynamics", "position"].shape[-1], device=generator.device) % 3
+    dynamics = windows["dynamics"].apply(lambda x: x * sign[..., entries])
+    windows["dynamics"] = dynamics.set("position", dynamics["position"] + offset[..., entries])
     return windows
 
 

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 
+from dynmap_rl.envs.task import BODIES, LAYOUT
+from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.keys import DYNAMICS
 
-from .demonstrations import META
+from .demonstrations import META, find_layout, find_meta
 from .format.columns import write_columns
-from .format.frames import choose_camera, iterate_frames
 from .format.reading import find_dataset, read_column, read_info, read_table, spans
-from .tracking import WIDEST, track_centroid
+from .normalization import planar_range, value_range
+from .quality import Derived, judge_quality
+from .sources import SOURCES, Motion, choose_view, read_motion
 
 METHODS = ("central", "savgol")
 
@@ -67,83 +71,149 @@ def differentiate(
 def add_dynamics(
     dataset: str | Path,
     output: str | Path,
+    source: str = "state",
     state: str = "observation.state",
     columns: Iterable[int] | None = None,
     angles: Iterable[int] = (),
     period: float = 2 * math.pi,
-    method: str = "central",
+    noise: float = 0.0,
+    angle_noise: float = 0.0,
+    noise_seed: int = 0,
+    method: str | None = None,
     window: int = 11,
     order: int = 3,
-    track: bool = False,
     camera: str | None = None,
+    objects: int | None = None,
     threshold: int = 30,
+    sort: str = "lowest",
+    width: float | None = None,
     replace: bool = False,
-) -> dict[str, np.ndarray]:
+) -> dict:
     """Copy a LeRobot v3.0 dataset and add the columns ``dynamics.position``, ``.velocity`` and ``.acceleration``.
 
     The columns (float32) are computed for one episode at a time, in float64, with the times of the column ``timestamp``.
     The new folder appears when it is complete. Videos are hard-linked where the file system can; all other files are
-    copied.
+    copied. A recording of a task stays one, and can be trained on with the recipes of the tasks: its constants of
+    normalisation and the names of its dynamics are written anew.
 
     Args:
         dataset: local folder or hub id.
         output: the new folder.
+        source: ``state``, or from the frames ``centroid``, ``tracks`` or ``flow`` (see
+            :class:`dynmap_rl.data.sources.Camera`).
         state: column whose entries are positions. They stay as measured, except for unwrapped angles.
         columns: entries of that column; by default all.
         angles: entries among ``columns`` that are angles and jump by ``period``.
         period: 2 pi for radians, 360 for degrees.
-        method: ``central`` or ``savgol`` (see :func:`differentiate`).
+        noise: standard deviation of normal noise that is added to the positions of a state, for experiments, in their
+            unit.
+        angle_noise: likewise of the angles.
+        noise_seed: seed of the noise.
+        method: ``central`` or ``savgol`` (see :func:`differentiate`); by default central for a state, savgol for frames.
         window: steps of the window of ``savgol``.
         order: order of the polynomial of ``savgol``.
-        track: take positions from frames in place of ``state`` (see
-            :func:`dynmap_rl.data.tracking.track_centroid`), in pixels of the camera's full frame.
-        camera: column of these frames; by default the first camera.
+        camera: column of the frames; by default the first camera.
+        objects: number of objects in the frames, for ``tracks`` and ``flow``; by default the number of bodies of a task
+            in the plane, otherwise one.
         threshold: smallest difference of a colour channel of a pixel that moves.
+        sort: order of the objects (see :func:`dynmap_rl.data.tracking.track_objects`).
+        width: width of the picture (m); by default 1 for a task in the plane, otherwise positions are in pixels.
         replace: replace existing dynamics columns.
 
     Returns:
-        The mean absolute difference from replaced columns, ``[D]`` by quantity.
+        ``differences``, the mean absolute difference from replaced columns, ``[D]`` by quantity; ``quality`` (see
+        :func:`dynmap_rl.data.quality.judge_quality`); and ``view``, the camera with all defaults, None for a state.
 
     Raises:
         ValueError: an argument is wrong, or the dataset is damaged or does not allow it.
         OSError: the folder cannot be written.
     """
     root, output = find_dataset(dataset), Path(output).expanduser()
-    info = read_info(root)
+    info, meta = read_info(root), find_meta(root)
     old = [name for q in DYNAMICS if (name := f"dynamics.{q}") in info["features"]]
     if old and not replace:
         raise ValueError(f"{root} must not have {', '.join(old)}; replace them with --replace")
     _check_output(root, output)
+    if source not in SOURCES:
+        raise ValueError(f"--source must be one of {', '.join(SOURCES)}, got {source!r}")
+    method = method or ("central" if source == "state" else "savgol")
     _check_method(method, window, order)
-    columns = _check_columns(root, info, state, columns, angles) if not track else None
-    camera = choose_camera(root, info, camera) if track else None
-    table = read_table(root, info, list({"timestamp", *old, *([] if track else [state])}))
-
-    def read(name: str, dtype=np.float64) -> np.ndarray:
-        return read_column(root, info, table, name, dtype).numpy()
-
-    if track:
-        names, angles, tracks = ["x", "y"], [], _track(root, info, camera, threshold)
+    planar = meta is not None and get_task(meta["task"]).planar
+    if source == "state":
+        if noise < 0 or angle_noise < 0:
+            raise ValueError(f"--noise and --angle_noise must be at least 0, got {noise} and {angle_noise}")
+        columns = _check_columns(root, info, state, columns, angles)
+        names, view = [entry_names(info, state)[i] for i in columns], None
+        angles = [columns.index(i) for i in angles]
+        motions = _read_state(root, info, state, columns, angles, period, (noise, angle_noise, noise_seed))
     else:
-        names = [entry_names(info, state)[i] for i in columns]
-        position, angles = read(state)[:, columns], [columns.index(i) for i in angles]
-    time = read("timestamp")[:, 0]
-    values = {q: np.empty((len(table), len(names))) for q in DYNAMICS}
-    for episode, rows in spans(table["episode_index"].to_numpy()):
-        own = tracks[episode] if track else position[rows]
-        own[:, angles] = np.unwrap(own[:, angles], axis=0, period=period)
+        frames = {"camera": camera, "objects": objects, "threshold": threshold, "sort": sort, "width": width}
+        view = choose_view(root, info, source, planar, **frames)
+        names, motions = view.names, read_motion(root, info, view)
+        if planar and view.objects == len(BODIES) // 3 and source != "centroid":
+            names = list(BODIES)
+    table = read_table(root, info, ["timestamp", *old])
+    time = read_column(root, info, table, "timestamp", np.float64).numpy()[:, 0]
+    rows = dict(spans(table["episode_index"].to_numpy()))
+    values, derived = {q: np.empty((len(table), len(names))) for q in DYNAMICS}, []
+    for episode, motion in motions:
+        own = motion.position
+        own[:, motion.angles] = np.unwrap(own[:, motion.angles], axis=0, period=motion.period)
         try:
-            parts = own, *differentiate(own, time[rows], method, window, order)
+            velocity, acceleration = differentiate(own, time[rows[episode]], method, window, order)
+            if motion.velocity is not None:
+                motion = dataclasses.replace(motion, other=velocity)
+                velocity = motion.velocity
+                acceleration = differentiate(velocity, time[rows[episode]], method, window, order)[0]
         except ValueError as error:
             raise ValueError(f"{root}: episode {episode} {error}") from error
-        for quantity, part in zip(DYNAMICS, parts, strict=True):
-            values[quantity][rows] = part
-    # Constants and scenes of a recording do not fit dynamics of other bodies.
-    same = old and info["features"][old[0]]["shape"] == [len(names)]
+        for quantity, part in zip(DYNAMICS, (own, velocity, acceleration), strict=True):
+            values[quantity][rows[episode]] = part
+        derived.append(Derived(episode, own, velocity, motion.light()))
     new = {f"dynamics.{q}": v.astype(np.float32) for q, v in values.items()}
-    write_columns(root, output, info, table, new, names, without=() if same else (META,))
-    there = {q: read(f"dynamics.{q}") for q in DYNAMICS if f"dynamics.{q}" in old}
-    return {q: np.abs(values[q] - v).mean(0) for q, v in there.items() if v.shape == values[q].shape}
+    meta = _describe(meta, planar, names, values, rows) if meta else None
+    write_columns(root, output, info, table, new, names, {META: meta})
+    there = {
+        q: read_column(root, info, table, f"dynamics.{q}", np.float64).numpy()
+        for q in DYNAMICS
+        if f"dynamics.{q}" in old
+    }
+    differences = {q: np.abs(values[q] - v).mean(0) for q, v in there.items() if v.shape == values[q].shape}
+    return {"differences": differences, "quality": judge_quality(derived, names), "view": view}
+
+
+def _read_state(
+    root: Path,
+    info: dict,
+    state: str,
+    columns: list[int],
+    angles: list[int],
+    period: float,
+    noise: tuple[float, float, int],
+) -> Iterator[tuple[int, Motion]]:
+    """Iterate over the episodes' positions in a column, with noise on lengths and angles."""
+    table = read_table(root, info, [state])
+    position = read_column(root, info, table, state, np.float64).numpy()[:, columns]
+    *sizes, seed = noise
+    scale = np.where(np.isin(np.arange(len(columns)), angles), sizes[1], sizes[0])
+    position += scale * np.random.default_rng(seed).standard_normal(position.shape)
+    for episode, rows in spans(table["episode_index"].to_numpy()):
+        yield episode, Motion(position[rows], angles, period)
+
+
+def _describe(
+    meta: dict, planar: bool, names: list[str], values: dict[str, np.ndarray], rows: dict[int, slice]
+) -> dict | None:
+    """Return the metadata of a recording with other dynamics; None where the recipes of its task cannot read them."""
+    kinds = [name.rpartition("_")[2] for name in names]
+    if planar and kinds != np.resize(["x", "y", "theta"], len(names)).tolist():
+        return None  # augmentation takes entries for x, y and theta
+    train = np.concatenate([np.arange(rows[e].start, rows[e].stop) for e in range(*meta["splits"]["train"])])
+    ranges = {q: planar_range(q, v[train]) if planar else value_range(v[train]) for q, v in values.items()}
+    layout = dataclasses.replace(find_layout(meta), position=tuple(names), velocity=tuple(names))
+    rest = {key: value for key, value in meta.items() if key != "layout"}
+    layout = {} if layout == LAYOUT else {"layout": layout.to_dict()}
+    return rest | layout | {"normalization": meta["normalization"] | ranges}
 
 
 def parse_entries(text: str | None, option: str) -> list[int] | None:
@@ -203,13 +273,3 @@ def _check_columns(root: Path, info: dict, state: str, columns, angles) -> list[
     if unknown := [i for i in angles if i not in columns]:
         raise ValueError(f"--angles must be among --columns {columns}, got {unknown}")
     return columns
-
-
-def _track(root: Path, info: dict, camera: str, threshold: int) -> dict[int, np.ndarray]:
-    tracks = {}
-    for episode, frames, factor in iterate_frames(root, info, camera, widest=WIDEST):
-        try:
-            tracks[episode] = (track_centroid(frames, threshold) + 0.5) * factor - 0.5
-        except ValueError as error:
-            raise ValueError(f"{root}: in episode {episode} {error}") from error
-    return tracks

@@ -22,20 +22,33 @@ def normalization_constants(episodes: TensorDictBase) -> dict[str, dict[str, lis
     Returns:
         ``low`` and ``high`` ``[D]`` of action, goal, position, velocity and acceleration, in SI units.
     """
-    natural = {  # middle and half width
-        "action": (0.0, ACTION_LIMIT),
-        "goal": (0.5, np.full(2, 0.5)),
-        "position": (np.tile([0.5, 0.5, 0.0], 2), np.full(6, 0.5)),
-        "velocity": (0.0, np.tile(VELOCITY_LIMIT, 2)),
-        "acceleration": (0.0, np.tile(ACCELERATION_LIMIT, 2)),
-    }
-    constants = {}
-    for name, (middle, half) in natural.items():
-        values = episodes[name if name in ("action", "goal") else ("dynamics", name)]
-        reach = np.abs(values.flatten(0, 1).double().numpy() - middle)  # [N, D]
-        half = np.maximum(half, np.quantile(reach, 0.999, axis=0))
-        constants[name] = {"low": (middle - half).tolist(), "high": (middle + half).tolist()}
-    return constants
+    values = {name: episodes[name if name in ("action", "goal") else ("dynamics", name)] for name in NATURAL}
+    return {name: planar_range(name, x.flatten(0, 1).double().numpy()) for name, x in values.items()}
+
+
+NATURAL = {  # middle and half width; those of the dynamics repeat for every body
+    "action": (np.zeros(3), ACTION_LIMIT),
+    "goal": (np.full(2, 0.5), np.full(2, 0.5)),
+    "position": (np.array([0.5, 0.5, 0.0]), np.full(3, 0.5)),
+    "velocity": (np.zeros(3), VELOCITY_LIMIT),
+    "acceleration": (np.zeros(3), ACCELERATION_LIMIT),
+}
+
+
+def planar_range(name: str, values: np.ndarray) -> dict[str, list[float]]:
+    """Compute the range of one quantity of the tasks (see :func:`normalization_constants`).
+
+    Args:
+        name: ``action``, ``goal`` or a quantity of the dynamics.
+        values: ``[N, D]``; entries of the dynamics are x, y and theta of one body after the other.
+
+    Returns:
+        ``low`` and ``high`` ``[D]``, in SI units.
+    """
+    middle, half = (np.resize(part, values.shape[1]) for part in NATURAL[name])
+    reach = np.abs(values - middle)
+    half = np.maximum(half, np.quantile(reach, 0.999, axis=0))
+    return {"low": (middle - half).tolist(), "high": (middle + half).tolist()}
 
 
 FLOORS = {"goal": 0.05, "position": 0.05, "velocity": 0.1, "acceleration": 1.0}  # m, m/s, m/s^2
@@ -88,8 +101,13 @@ def range_constants(episodes: TensorDictBase) -> dict[str, dict[str, list[float]
     constants = {}
     for key in ("action", "goal", *(("dynamics", q) for q in episodes.get("dynamics", {}).keys())):
         values = episodes[key].flatten(0, 1).double().numpy()  # [N, D]
-        low, high = np.quantile(values, [0.001, 0.999], axis=0)
-        still = high - low <= 1e-6 * np.maximum(1, np.abs(high))
-        low, high = np.where(still, low - 0.5, low), np.where(still, high + 0.5, high)
-        constants[key[-1] if isinstance(key, tuple) else key] = {"low": low.tolist(), "high": high.tolist()}
+        constants[key[-1] if isinstance(key, tuple) else key] = value_range(values)
     return constants
+
+
+def value_range(values: np.ndarray) -> dict[str, list[float]]:
+    """Compute the range of values ``[N, D]`` (see :func:`range_constants`)."""
+    low, high = np.quantile(values, [0.001, 0.999], axis=0)
+    still = high - low <= 1e-6 * np.maximum(1, np.abs(high))
+    low, high = np.where(still, low - 0.5, low), np.where(still, high + 0.5, high)
+    return {"low": low.tolist(), "high": high.tolist()}

@@ -1,7 +1,12 @@
-"""Tracking of moving objects in frames: positions for datasets without a state."""
+"""Tracking of moving objects in frames: positions for datasets without a state.
+
+The camera must stand still and the light must not change. What moves is found as the difference from a background, the
+median of the episode. Depth is not measured.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import pairwise
 
 import cv2
@@ -9,25 +14,51 @@ import numpy as np
 
 SAMPLES = 51  # frames whose median is the background; odd, so that every median is a value of a frame
 WIDEST = 160  # pixels that frames are reduced to, as the centroid is finer than a pixel
+BINS = 16  # levels of a colour channel in histograms
+SPARE = 3  # colours besides those of the objects: shadows, edges, and places that were taken for background
+FAINTEST = 0.3  # share of the usual area from which on an object counts as found
+RAREST = 0.1  # share of the frames in which a colour must be seen to be that of an object
+SORTS = "lowest", "largest", "brightest"
 
 
-def track_centroid(frames: np.ndarray, threshold: int = 30) -> np.ndarray:
+@dataclass(frozen=True)
+class Tracks:
+    """Tracks of N objects in an episode of T frames.
+
+    Attributes:
+        pose: ``[T, N, 3]``, x (right) and y (down) of the centre in pixels, and the angle (rad, clockwise in the
+            picture); interpolated where the object is not found.
+        found: bool ``[T, N]``.
+        area: pixels of the object, ``[T, N]``; 0 where it is not found.
+        cut: bool ``[T, N]``, whether the object touches the border of the picture.
+        labels: uint8 ``[T, height, width]``, number of the object of a pixel from 1 on, 0 elsewhere.
+        moving: share of the pixels that ever differ from the background.
+    """
+
+    pose: np.ndarray
+    found: np.ndarray
+    area: np.ndarray
+    cut: np.ndarray
+    labels: np.ndarray
+    moving: float
+
+
+def track_centroid(frames: np.ndarray, threshold: int = 30) -> tuple[np.ndarray, np.ndarray]:
     """Compute the centroid of all pixels that differ from the episode's background.
 
     The background is the median of frames at equal distances in the total change of the picture, not in time, so that an
     object at rest for most of an episode does not become background. Pixels weigh by their difference. Specks smaller
-    than 3 x 3 pixels are left out. A frame without a difference repeats the last centroid, or the first one to come.
+    than 3 x 3 pixels are left out. The centroid of a frame without a difference is interpolated.
 
-    The centroid is one point for all that moves: arm, object and shadows together. The camera must stand still and the
-    light must not change. An object that never moves is not found. A place where an object stays for most of the change
-    counts as moving when the object has left it. Depth and angles are not measured.
+    The centroid is one point for all that moves: arm, object and shadows together. An object that never moves is not
+    found. A place where an object stays for most of the change counts as moving when the object has left it.
 
     Args:
         frames: frames of one episode, uint8 ``[T, height, width, 3]``.
         threshold: smallest difference of a colour channel, 0 to 255, of a pixel that moves.
 
     Returns:
-        ``[T, 2]``, x (right) and y (down) in pixels, float64.
+        ``[T, 2]``, x (right) and y (down) in pixels, float64, and whether something was found, bool ``[T]``.
 
     Raises:
         ValueError: nothing moves. The message is the end of a sentence.
@@ -40,13 +71,170 @@ def track_centroid(frames: np.ndarray, threshold: int = 30) -> np.ndarray:
         moments = cv2.moments(difference * mask)
         if moments["m00"]:
             centroids[t] = moments["m10"] / moments["m00"], moments["m01"] / moments["m00"]
-    seen = ~np.isnan(centroids[:, 0])
-    if not seen.any():
-        raise ValueError(
-            f"nothing moves: no pixel differs by more than {threshold} of 255; use a lower --threshold"
-        )
-    last = np.maximum.accumulate(np.where(seen, np.arange(len(frames)), np.argmax(seen)))
-    return centroids[last]
+    found = ~np.isnan(centroids[:, 0])
+    if not found.any():
+        raise ValueError(_still(threshold))
+    return fill_gaps(centroids, found), found
+
+
+def track_objects(frames: np.ndarray, objects: int = 1, threshold: int = 30, sort: str = "lowest") -> Tracks:
+    """Segment what moves into objects, and measure centre and angle of each in every frame.
+
+    A pixel belongs to what moves if its colour is more frequent among pixels that differ from the background than
+    among pixels that never do. So an object is found where it rests, and its place in the background is not taken
+    for an object. Several objects are told apart by their colours (k-means over the episode; colours that differ by less
+    than ``threshold`` are one). Colours that are seen in less than a tenth of the frames, or that move less, are left
+    out. The object is the largest connected region of its colour; centre and angle are its moments.
+
+    An object of several colours needs ``objects`` = 1, and objects of one colour are not told apart. The angle is
+    that of the longest axis, or of the shortest one if that is nearer to the horizontal in the first frame. It means
+    little for an object as wide as tall.
+
+    Args:
+        frames: frames of one episode, uint8 ``[T, height, width, 3]``.
+        objects: number of objects N.
+        threshold: smallest difference of a colour channel, 0 to 255, of a pixel that moves.
+        sort: order of the objects: ``lowest`` in the picture first, at the first frame; ``largest`` or ``brightest``
+            first. The order must be the same in all episodes.
+
+    Raises:
+        ValueError: fewer objects move, or no pixel is at rest. The message is the end of a sentence.
+    """
+    background = _background(frames, threshold)
+    changed = np.stack([_changed(frame, background, threshold) > 0 for frame in frames])
+    ever = changed.any(0)
+    if not ever.any():
+        raise ValueError(_still(threshold))
+    if ever.all():
+        raise ValueError("every pixel changes; the camera must stand still, and the light must not change")
+    labels = _split(frames, _moving(frames, changed, ever), objects, threshold)
+    regions = [[_measure(frame_labels == n) for n in range(1, objects + 1)] for frame_labels in labels]
+    area = np.array([[region[1] for region in row] for row in regions], float)
+    found = area >= np.array([_faintest(column) for column in area.T])
+    if not found.any(0).all():
+        raise ValueError(f"must have {objects} objects that move, got fewer; use fewer --objects")
+    pose = np.array([[region[0] for region in row] for row in regions])
+    cut = np.array([[region[2] for region in row] for row in regions]) & found
+    for n in range(objects):
+        pose[:, n, 2] = _straighten(pose[:, n, 2], found[:, n])
+        pose[:, n] = fill_gaps(pose[:, n], found[:, n])
+    order = _order(sort, pose, area, found, frames, labels)
+    numbers = np.zeros(objects + 1, np.uint8)
+    numbers[np.asarray(order) + 1] = np.arange(1, objects + 1)
+    return Tracks(
+        pose[:, order],
+        found[:, order],
+        (area * found)[:, order],
+        cut[:, order],
+        numbers[labels],
+        float(ever.mean()),
+    )
+
+
+def fill_gaps(values: np.ndarray, found: np.ndarray) -> np.ndarray:
+    """Interpolate values ``[T, D]`` linearly where they were not found; the ends repeat the nearest value."""
+    time = np.arange(len(values))
+    return np.stack([np.interp(time, time[found], column[found]) for column in values.T], 1)
+
+
+def _moving(frames: np.ndarray, changed: np.ndarray, ever: np.ndarray) -> np.ndarray:
+    """Return masks ``[T, height, width]`` of what moves, by colour."""
+    colors = (frames // (256 // BINS)).astype(np.int32) @ np.array([BINS**2, BINS, 1], np.int32)
+    moving, still = (
+        np.bincount(colors[where], minlength=BINS**3) for where in (changed, _every(frames, ~ever))
+    )
+    likely = moving / moving.sum() > still / still.sum()
+    masks = likely[colors]
+    for mask in masks:  # what never changes may have the same colour
+        count, regions = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
+        touched = np.bincount(regions[ever], minlength=count) > 0
+        mask &= touched[regions]
+    return masks
+
+
+def _every(frames: np.ndarray, where: np.ndarray) -> np.ndarray:
+    return np.broadcast_to(where, frames.shape[:3])
+
+
+def _split(frames: np.ndarray, masks: np.ndarray, objects: int, threshold: int) -> np.ndarray:
+    """Return the number of the object of every pixel, uint8 ``[T, height, width]``; 0 is none."""
+    if objects == 1:
+        return masks.astype(np.uint8)
+    few = f"must have {objects} objects of different colours that move, got fewer; use fewer --objects"
+    pixels = frames[masks].astype(np.float32)
+    sample = pixels[:: max(1, len(pixels) // 20_000)]
+    if (count := len(np.unique(sample, axis=0))) < objects:
+        raise ValueError(few)
+    cv2.setRNGSeed(0)
+    criteria = cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 0.5
+    count = min(objects + SPARE, count)
+    _, _, centers = cv2.kmeans(sample, count, None, criteria, 3, cv2.KMEANS_PP_CENTERS)
+    merged = _merge(centers, threshold)
+    nearest = np.full(masks.shape, len(centers), np.uint8)
+    nearest[masks] = merged[np.square(pixels[:, None] - centers).sum(-1).argmin(1)]
+    motion = [_motion(nearest == k) for k in range(len(centers))]
+    chosen = np.argsort(motion)[::-1][:objects]
+    if not np.take(motion, chosen).all():
+        raise ValueError(few)
+    numbers = np.zeros(len(centers) + 1, np.uint8)
+    numbers[chosen] = np.arange(1, objects + 1)
+    return numbers[nearest]
+
+
+def _merge(centers: np.ndarray, threshold: int) -> np.ndarray:
+    """Return for each colour the number of the first of those that differ by less than the threshold, in chains."""
+    close = np.abs(centers[:, None] - centers).max(-1) < threshold
+    for _ in centers:
+        close = close @ close
+    return close.argmax(1).astype(np.uint8)
+
+
+def _motion(masks: np.ndarray) -> float:
+    """Return how much a colour moves: the spread of its centre times the root of its area, 0 for a rare colour."""
+    area = masks.sum((1, 2))
+    seen = area >= _faintest(area)
+    if seen.mean() < RAREST:
+        return 0.0
+    centers = np.array([np.argwhere(mask).mean(0) for mask in masks[seen]])
+    spread = np.linalg.norm(np.quantile(centers, 0.95, axis=0) - np.quantile(centers, 0.05, axis=0))
+    return float(spread * np.sqrt(np.median(area[seen])))
+
+
+def _faintest(area: np.ndarray) -> float:
+    """Return the area from which on an object counts as found, given its area in all frames."""
+    return max(4.0, FAINTEST * float(np.median(area[area > 0]))) if area.any() else np.inf
+
+
+def _measure(mask: np.ndarray) -> tuple[tuple[float, float, float], int, bool]:
+    """Return pose (pixels, rad), area, and whether it touches the border, of the largest region of a mask."""
+    count, regions, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    if count == 1:
+        return (0.0, 0.0, 0.0), 0, False
+    largest = 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
+    moments = cv2.moments((regions == largest).astype(np.uint8), binaryImage=True)
+    x, y = moments["m10"] / moments["m00"], moments["m01"] / moments["m00"]
+    angle = 0.5 * np.arctan2(2 * moments["mu11"], moments["mu20"] - moments["mu02"])
+    left, top, width, height, area = stats[largest]
+    cut = left == 0 or top == 0 or left + width == mask.shape[1] or top + height == mask.shape[0]
+    return (x, y, angle), int(area), bool(cut)
+
+
+def _straighten(angle: np.ndarray, found: np.ndarray) -> np.ndarray:
+    """Unwrap angles of an axis, which has no direction, and begin within an eighth of a turn of 0."""
+    angle = angle.copy()
+    angle[found] = np.unwrap(angle[found], period=np.pi)
+    return angle - np.pi / 2 * np.round(np.median(angle[found][:5]) / (np.pi / 2))
+
+
+def _order(sort: str, pose, area, found, frames, labels) -> list[int]:
+    count = pose.shape[1]
+    if sort == "lowest":
+        values = -pose[0, :, 1]
+    elif sort == "largest":
+        values = -np.array([np.median(area[found[:, n], n]) for n in range(count)])
+    else:
+        values = -np.array([frames[labels == n + 1].mean() for n in range(count)])
+    return np.argsort(values, kind="stable").tolist()
 
 
 def _background(frames: np.ndarray, threshold: int) -> np.ndarray:
@@ -59,3 +247,7 @@ def _background(frames: np.ndarray, threshold: int) -> np.ndarray:
 def _changed(frame: np.ndarray, other: np.ndarray, threshold: int) -> np.ndarray:
     """Return the largest difference of two frames over the channels, and 0 where it is below the threshold."""
     return cv2.threshold(cv2.absdiff(frame, other).max(2), threshold, 0, cv2.THRESH_TOZERO)[1]
+
+
+def _still(threshold: int) -> str:
+    return f"nothing moves: no pixel differs by more than {threshold} of 255; use a lower --threshold"

@@ -12,7 +12,7 @@ from dynmap_rl.data.features import compute_features
 from dynmap_rl.modules.world_model import WorldModel
 from dynmap_rl.objectives.imitation import ImitationLoss, imitation_loss
 
-GROUPS = {"": [0, 1, 3, 4], "_angle": [2, 5]}  # entries of the tasks' dynamics that share a unit
+GROUPS = {"": (0, 1), "_angle": (2,)}  # entries of a body's dynamics (x, y, theta) that share a unit
 STATES = ("latent", "hidden1", "hidden2", "goal")
 
 
@@ -43,9 +43,11 @@ def prediction_errors(
         errors = {"rgb": error.square().flatten(2).mean(-1).sqrt().mean()}
         for name, value in world_model.decode_dynamics(*states).items():
             difference = (value - chunk["dynamics", name])[:, 1:].abs()
-            groups = {f"_{i}": [i] for i in range(difference.shape[-1])} if by_entry else GROUPS
-            for group, entries in groups.items():
-                errors[f"{name}{group}"] = difference[..., entries].mean()
+            size = difference.shape[-1]
+            groups = {g: [i for i in range(size) if i % 3 in entries] for g, entries in GROUPS.items()}
+            for group, entries in ({f"_{i}": [i] for i in range(size)} if by_entry else groups).items():
+                if entries:  # a point has no angle
+                    errors[f"{name}{group}"] = difference[..., entries].mean()
         for name, value in errors.items():
             sums[f"error_{name}"] = sums.get(f"error_{name}", 0.0) + value.item() * len(chunk) / len(episodes)
     return sums

@@ -91,7 +91,8 @@ def _roll_out(
     keys = ["action", "goal", *EVENTS, *([pixels] if keep_pixels else [])]
     td = env.reset(scene_seed=torch.tensor(seeds))
     world_model = getattr(actor, "world_model", None)
-    sizes = {q: len(env.layout.dynamics[q]) for q in (world_model.supervision if world_model else ())}
+    supervision = world_model.supervision if world_model else ()
+    sizes = {q: world_model.dynamics_decoder.normalizers[q].size for q in supervision}
     predicted = {quantity: torch.zeros(count, size, device=device) for quantity, size in sizes.items()}
     pushed, steps = any(plan.pushes for plan in plans), []
     for t in tqdm(range(env.layout.steps), title, unit="step", leave=False, disable=title is None):
@@ -120,7 +121,7 @@ def episode_rows(episodes: TensorDict, seeds: list[int]) -> list[dict]:
 
     Returns:
         Rows with ``scene_seed``, ``dropped``, ``touched`` (the cart touched a wall), ``position_error`` (m) and
-        ``success``. If the world model decodes positions, ``localization_error`` is the mean distance between predicted
+        ``success``. If the world model decodes positions of all bodies, ``localization_error`` is the mean distance between predicted
         and true position of the first body, the cart or the object of a MuJoCo task (m), and
         ``localization_error_away`` its mean over the steps more than 0.1 m from the goal.
     """
@@ -135,11 +136,12 @@ def episode_rows(episodes: TensorDict, seeds: list[int]) -> list[dict]:
         }
         for i, seed in enumerate(seeds)
     ]
-    if "position" in episodes["predicted_dynamics"].keys():
-        error = episodes["predicted_dynamics", "position"] - episodes["dynamics", "position"]
+    truth, predicted = (episodes[key].get("position", None) for key in ("dynamics", "predicted_dynamics"))
+    if predicted is not None and predicted.shape == truth.shape:  # a world model may know other entries
+        error = predicted - truth
         axes = episodes["goal"].shape[-1]  # the goal is a point in the plane or in space
         error = error[:, 1:, :axes].norm(dim=-1)  # [E, T - 1]
-        away = (episodes["dynamics", "position"][..., :axes] - episodes["goal"])[:, 1:].norm(dim=-1) > 0.1
+        away = (truth[..., :axes] - episodes["goal"])[:, 1:].norm(dim=-1) > 0.1
         away_error = (error * away).sum(1) / away.sum(1).clamp(min=1)
         for row, value, value_away in zip(rows, error.mean(1).tolist(), away_error.tolist(), strict=True):
             row["localization_error"] = round(value, 5)

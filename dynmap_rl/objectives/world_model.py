@@ -24,9 +24,10 @@ class WorldModelLoss(LossModule):
     Input: ``pixels`` uint8 ``[B, T, 3, 64, 64]``, ``action`` ``[B, T, A]`` and, for every supervised quantity,
     ``("dynamics", quantity)`` ``[B, T, D]``, in SI units. Optional: a mask of valid steps, bool ``[B, T]`` or
     ``[B, T, 1]``, under ``loss_mask_key`` of :class:`torchrl.objectives.LossModule`, by default
-    ``("collector", "mask")``; invalid steps are left out.
+    ``("collector", "mask")``; invalid steps are left out. Also optional: ``labelled``, bool ``[B, T]`` or ``[B, T, 1]``,
+    the steps whose dynamics are known; the loss of the dynamics is the mean over these.
 
-    Output: ``loss_rgb``, ``loss_latent`` (times ``beta_z``) and, where supervised, ``loss_position``,
+    Output: ``loss_rgb`` (times ``beta_rgb``), ``loss_latent`` (times ``beta_z``) and, where supervised, ``loss_position``,
     ``loss_velocity``, ``loss_acceleration`` (times ``beta_dynamics``): scalars whose sum is to be minimised.
 
     Args:
@@ -39,6 +40,7 @@ class WorldModelLoss(LossModule):
             background outweighs small objects.
         imagined: share of the windows in which the world model sees no frames from a random step on, and predicts from
             its own predictions. 0 is the paper's loss; more makes predictions over many steps accurate.
+        beta_rgb: weight of ``loss_rgb``; with 0, no frames are decoded and this loss is missing.
         rgb_frames: number of random frames of the batch that are decoded; None decodes all.
         generator: generator that draws these frames and steps; by default torch's own.
     """
@@ -48,6 +50,7 @@ class WorldModelLoss(LossModule):
         pixels: NestedKey = "pixels"
         action: NestedKey = "action"
         dynamics: NestedKey = "dynamics"
+        labelled: NestedKey = "labelled"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -60,6 +63,7 @@ class WorldModelLoss(LossModule):
         stop_gradient: bool = True,
         rarity: float = 0.0,
         imagined: float = 0.0,
+        beta_rgb: float = 1.0,
         rgb_frames: int | None = None,
         generator: torch.Generator | None = None,
     ):
@@ -67,7 +71,7 @@ class WorldModelLoss(LossModule):
         self.world_model, self.generator = world_model, generator
         self.beta_z, self.beta_dynamics = beta_z, beta_dynamics
         self.stop_gradient, self.rarity = stop_gradient, rarity
-        self.imagined, self.rgb_frames = imagined, rgb_frames
+        self.imagined, self.beta_rgb, self.rgb_frames = imagined, beta_rgb, rgb_frames
 
     @property
     def in_keys(self) -> list[NestedKey]:
@@ -79,7 +83,8 @@ class WorldModelLoss(LossModule):
     @property
     def out_keys(self) -> list[str]:
         """Keys that the loss writes; their sum is to be minimised."""
-        return [f"loss_{name}" for name in ("rgb", "latent", *self.world_model.supervision)]
+        first = ("rgb", "latent") if self.beta_rgb else ("latent",)
+        return [f"loss_{name}" for name in (*first, *self.world_model.supervision)]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
@@ -122,19 +127,26 @@ class WorldModelLoss(LossModule):
         predicted, hidden1, hidden2 = (x[:, 1:] for x in states)  # (B, T-1, .)
         pixels = tensordict[keys.pixels][:, 1:]
         masks = tensordict.select(*self._loss_mask_keys(), strict=False)[:, 1:]
-        losses = {
-            "loss_rgb": self._rgb_loss(masks, pixels, predicted, hidden1, hidden2),
-            "loss_latent": self.beta_z * self._mean(self._latent_error(latent, predicted, read), masks),
-        }
+        known = tensordict.get(keys.labelled, None)
+        known = known if known is None else known[:, 1:]
+        losses = {}
+        if self.beta_rgb:
+            rgb = self._rgb_loss(masks, pixels, predicted, hidden1, hidden2)
+            losses["loss_rgb"] = self.beta_rgb * rgb
+        losses["loss_latent"] = self.beta_z * self._mean(self._latent_error(latent, predicted, read), masks)
         for name, value in model.decode_dynamics(predicted, hidden1, hidden2).items():
             scale = model.dynamics_decoder.normalizers[name].scale
             truth = tensordict[unravel_key((keys.dynamics, name))][:, 1:]
-            losses[f"loss_{name}"] = self.beta_dynamics * self._mean(rms((value - truth) / scale), masks)
+            losses[f"loss_{name}"] = self.beta_dynamics * self._mean(
+                rms((value - truth) / scale), masks, known
+            )
         return losses
 
-    def _mean(self, error: torch.Tensor, masks: TensorDictBase) -> torch.Tensor:
-        """Return the mean of an error over the valid steps ``[B, T]``."""
-        return self._reduce_loss(error, masks, reduction="mean")
+    def _mean(
+        self, error: torch.Tensor, masks: TensorDictBase, known: torch.Tensor | None = None
+    ) -> torch.Tensor:
+        """Return the mean of an error ``[B, T]`` over the valid steps that are known; 0 where there is none."""
+        return self._reduce_loss(error, masks, mask=known, reduction="mean")
 
     def _latent_error(self, latent, predicted, read) -> torch.Tensor:
         before, target = (latent if read is None else read)[:, :-1], latent[:, 1:]

@@ -8,7 +8,7 @@ from dynmap_rl.evaluation.protocol import result_rows
 from dynmap_rl.evaluation.statistics import shared_interval, summarize
 from dynmap_rl.utils.files import read_json
 
-from .cells import Cell
+from .cells import Run
 from .tables import join_table
 
 TASKS = "FetchPush", "FetchSlide", "PlateSlide", "Soccer"
@@ -23,21 +23,23 @@ METHODS = {  # by the row of the table: recipe, its options, and minutes of one 
 }
 
 
-def list_benchmarks(episodes: int = 500) -> dict[tuple[str, str, int], Cell]:
-    """Return the cells by task, method and seed; each trains from the start and evaluates on ``episodes`` scenes."""
-    cells = {}
+def list_benchmarks(episodes: int = 500) -> dict[tuple[str, str, int], Run]:
+    """Return the runs by task, method and seed; each trains from the start and evaluates on ``episodes`` scenes."""
+    runs = {}
     for task in TASKS:
         for method, (recipe, options, _) in METHODS.items():
             for seed in SEEDS:
                 arguments = ["--task", f"mujoco:{task}", *options, "--seeds", str(seed)]
                 arguments += ["--world_model.seed", str(seed)] if recipe == "decoupled" else []
                 arguments += ["--eval.episodes", str(episodes), "--eval.paper_episodes", "0"]
-                cells[task, method, seed] = Cell(name_cell(task, method, seed), recipe, tuple(arguments))
-    return cells
+                cell = f"mujoco:{task}", recipe, "recurrent", method
+                name = name_run(task, method, seed)
+                runs[task, method, seed] = Run(name, recipe, cell, tuple(arguments), table="mujoco")
+    return runs
 
 
-def name_cell(task: str, method: str, seed: int) -> str:
-    """Return the name of a cell, its run and its result."""
+def name_run(task: str, method: str, seed: int) -> str:
+    """Return the name of a run and of its result."""
     words = method.lower().translate(str.maketrans("-+ ", "___", "[]"))
     return f"{task.lower()}_{words}_seed_{seed}"
 
@@ -46,7 +48,7 @@ def read_benchmarks(results: Path) -> dict[tuple[str, str], list[dict]]:
     """Read the results by task and method, each a list of the seeds that are there."""
     found = {}
     for task, method, seed in list_benchmarks():
-        path = results / f"{name_cell(task, method, seed)}.json"
+        path = results / f"{name_run(task, method, seed)}.json"
         if path.exists():
             found.setdefault((task, method), []).append(read_json(path))
     return found

@@ -143,10 +143,11 @@ def draw_reconstruction(figure, out: TensorDictBase, steps: list[list[int]], dt:
 
 def draw_dynamics(figure, out: TensorDictBase, supervision: tuple[str, ...], layout: Layout = LAYOUT) -> None:
     """Draw the dynamics of a body along one episode ``[T]`` (see :func:`predict`), a row for each quantity."""
-    axes = figure.subplots(len(supervision), 3, squeeze=False, sharex=True)
     time, first = np.arange(out.shape[0]) * layout.dt, 3 if layout == LAYOUT else 0
+    count = min(3, len(layout.position) - first)  # a point has two entries
+    axes = figure.subplots(len(supervision), count, squeeze=False, sharex=True)
     for row, quantity in enumerate(supervision):
-        for column in range(3):
+        for column in range(count):
             axis, index = axes[row, column], first + column
             body, _, component = layout.dynamics[quantity][index].rpartition("_")
             unit = UNITS[quantity][2 if component == "theta" else 0]

@@ -24,6 +24,7 @@ PICTURES = {  # in this order
     "open_loop.png": "Error of open-loop predictions against the time without frames",
     "probes.png": "R^2 of linear maps from the states to the dynamics",
     "perception.png": "Held-out demonstrations, and what each world model predicted from the frame before",
+    "tracks.png": "The objects that were tracked, in the episode of the worst check",
     "episodes.gif": "Some of the episodes",
     "dynamics.png": "The dynamics of the first episode",
 }

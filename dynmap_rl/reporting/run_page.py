@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 from tensordict import TensorDictBase
 
-from dynmap_rl.data.demonstrations import find_meta
+from dynmap_rl.data.demonstrations import find_layout, find_meta
 from dynmap_rl.data.format.reading import find_dataset
-from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.evaluation.protocol import result_rows, unpack_rows
 from dynmap_rl.evaluation.statistics import shared_interval, summarize, summarize_seeds
 from dynmap_rl.modules.actor import Actor
@@ -132,7 +131,9 @@ def _draw(folder: Path, world_model: WorldModel, episodes: TensorDictBase, resul
     from .figures import plot_dynamics, plot_reconstruction
 
     world_model.cpu()  # as the episodes are
-    layout = get_task(result["task"]).layout
+    layout = find_layout(
+        find_meta(find_dataset(result["trained_on"]["dataset"]))
+    )  # its dynamics may be others
     if result["world_model"]["training"] != "end_to_end":  # its decoders are not trained
         path = folder / "figures" / "reconstruction.png"
         plot_reconstruction(world_model, episodes[:3], path, dt=layout.dt)

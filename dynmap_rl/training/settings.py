@@ -57,10 +57,15 @@ class WorldModelTraining(WorldModelArchitecture):
     # Weight of rare colours in the RGB loss: a pixel's weight falls with this power of the number of pixels of its
     # colour; 0 is the paper's plain L2.
     rarity: float = 0.75
+    # Weight of the RGB loss (Eq. 4a); with 0, no frames are decoded, and the dynamics alone shape the states.
+    beta_rgb: float = 1.0
     # Weight of the latent loss (Eq. 4a).
     beta_z: float = 0.1
     # Weight of the loss of every supervised quantity (Eq. 5).
     beta_dynamics: float = 1.0
+    # Share of the training episodes whose dynamics are used; those of the others are left out of the loss. Which
+    # episodes follows from the seed, and smaller shares are parts of larger ones.
+    labelled: float = 1.0
     # Seed of weights and windows.
     seed: int = 0
     # Random changes of the windows.
@@ -73,6 +78,16 @@ class WorldModelTraining(WorldModelArchitecture):
         check_at_least(
             self, 0, "short_windows", "imagined", "learning_rate", "rarity", "beta_z", "beta_dynamics"
         )
+        check_at_least(self, 0, "beta_rgb")
+        if not 0 < self.labelled <= 1:
+            raise ValueError(
+                f"{type(self).__name__}.labelled must be above 0 and at most 1, got {self.labelled}; supervision none "
+                "uses no dynamics"
+            )
+        if not self.beta_rgb and self.supervision == "none":
+            raise ValueError(
+                f"{type(self).__name__}.beta_rgb must be above 0 without supervision, got 0; nothing would be learned"
+            )
 
 
 @dataclass(frozen=True)

@@ -69,10 +69,13 @@ def train_world_model(
         ValueError: the loss is not finite or diverges; the last training state is kept.
     """
     settings = settings or WorldModelTraining()
+    train = episodes["train"]
+    if settings.labelled < 1:
+        train = train.copy().set("labelled", choose_labelled(train, settings.labelled, settings.seed))
     fit(
         world_model,
         lambda generator: make_loss(world_model, settings, generator),
-        episodes["train"],
+        train,
         lambda: prediction_errors(world_model, episodes["eval"], by_entry=by_entry),
         folder,
         settings,
@@ -82,12 +85,32 @@ def train_world_model(
     )
 
 
+def choose_labelled(episodes: TensorDictBase, share: float, seed: int) -> torch.Tensor:
+    """Draw the episodes whose dynamics are used, at least one.
+
+    Args:
+        episodes: ``[E, T]``; pieces with the same ``episode`` are drawn together.
+        share: share of the episodes.
+        seed: seed of the draw. A smaller share of the same seed is a part of a larger one.
+
+    Returns:
+        Bool ``[E, T, 1]``.
+    """
+    count, steps = episodes.shape
+    index = episodes.get("episode", None)
+    index = torch.arange(count) if index is None else index.reshape(count, steps)[:, 0].cpu()
+    unique = index.unique()
+    order = torch.randperm(len(unique), generator=torch.Generator().manual_seed(seed))
+    chosen = torch.isin(index, unique[order[: max(1, round(share * len(unique)))]])
+    return chosen.to(episodes["pixels"].device)[:, None, None].expand(count, steps, 1)
+
+
 def make_loss(
     world_model: WorldModel, settings: WorldModelTraining | JointTraining, generator: torch.Generator
 ) -> WorldModelLoss:
     """Make the world model's loss module, whose decoded frames ``generator`` draws; processes share them."""
     weights = {"beta_z": settings.beta_z, "beta_dynamics": settings.beta_dynamics, "rarity": settings.rarity}
     if isinstance(settings, WorldModelTraining):
-        weights["imagined"] = settings.imagined
+        weights |= {"imagined": settings.imagined, "beta_rgb": settings.beta_rgb}
     frames = max(1, settings.rgb_frames // ranks())
     return WorldModelLoss(world_model, **weights, rgb_frames=frames, generator=generator)

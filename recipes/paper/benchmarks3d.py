@@ -51,7 +51,7 @@ class Config:
 def main(config: Config) -> None:
     """Run the cells without a result, and write the table."""
     from dynmap_rl.paper.benchmarks import METHODS, list_benchmarks
-    from dynmap_rl.paper.launch import is_done, launch, run_cell
+    from dynmap_rl.paper.launch import execute, is_done, launch
 
     if config.write:
         return write(config)
@@ -72,7 +72,7 @@ def main(config: Config) -> None:
     for task in sorted({cell.task for cell in todo.values()}):  # cells must not record at the same time
         find_or_record(task)
     run = partial(
-        run_cell, recipes=RECIPES, results=config.results, runs=config.runs,
+        execute, recipes=RECIPES, results=config.results, runs=config.runs,
         threads=2 if config.workers == 1 else 1, presets=config.presets, root=Path.cwd(),
     )  # fmt: skip
     failed = launch(list(todo.values()), run, workers=config.workers)

@@ -1,86 +1,127 @@
 """How good dynamics are that ``recipes/add_dynamics.py`` derives: our own recordings know the truth.
 
     uv run python tests/benchmarks/derivatives.py
+    uv run python tests/benchmarks/derivatives.py --datasets datasets/bin_dropping --episodes 20 --output found.json
 
-From the recorded positions, by central differences and by Savitzky-Golay, with and without noise of 2 mm and 0.01 rad
-on them; and from the frames. Needs ``datasets/balance_reaching`` (``python recipes/collect.py``). Writes
-``recipes/results/measurements/derivatives.json``.
+From the recorded positions, by central differences and by Savitzky-Golay, with noise of 0, 2, 5 and 10 mm (and 5 rad on
+the angles for each metre); and from the frames. Needs ``datasets/TASK`` of the three tasks (``python recipes/collect.py
+--task TASK``). Writes ``recipes/results/measurements/derivatives.json``.
 """
 
 from __future__ import annotations
 
-import tempfile
+import argparse
+import shlex
+import sys
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from dynmap_rl.data.demonstrations import load_dataset
-from dynmap_rl.data.derive import add_dynamics, differentiate
+from dynmap_rl.data.derive import differentiate
+from dynmap_rl.data.format.reading import read_info
+from dynmap_rl.data.sources import choose_view, read_motion
 from dynmap_rl.envs.world import CONTROL_DT
+from dynmap_rl.keys import DYNAMICS
 from dynmap_rl.utils.files import write_json
+from dynmap_rl.utils.version import find_commit
 
 RESULTS = Path(__file__).parents[2] / "recipes/results/measurements" / "derivatives.json"
-DATASET = "datasets/balance_reaching"
-QUANTITIES = "velocity", "acceleration"
-NOISE = np.array([0.002, 0.002, 0.01] * 2)  # m, m, rad
-PIXEL = 1 / 64  # m
+TASKS = "balance_reaching", "balance_reaching_obstacle", "bin_dropping"
+NOISES = 0, 2, 5, 10  # mm
+TURN = 5  # rad of noise on the angles for a metre on the positions
+METHODS = "central", "savgol"
+Dynamics = dict[str, np.ndarray]  # by quantity, [E, T, D]
 
 
-def derived(truth: dict[str, np.ndarray], method: str, noise: float) -> dict[str, dict[str, float]]:
-    """Mean absolute errors, cart and block together: of x and y (m/s, m/s^2), and of the angles (rad/s, rad/s^2)."""
-    rng = np.random.default_rng(0)
-    time = CONTROL_DT * np.arange(truth["position"].shape[1])
-    errors = {quantity: [] for quantity in QUANTITIES}
-    for i, position in enumerate(truth["position"]):
-        noisy = position + noise * NOISE * rng.standard_normal(position.shape)
-        for quantity, values in zip(QUANTITIES, differentiate(noisy, time, method), strict=True):
-            errors[quantity].append(np.abs(values - truth[quantity][i]))
-    return {quantity: _by_kind(np.stack(values)) for quantity, values in errors.items()}
+def compare(found: Dynamics, truth: Dynamics) -> dict[str, dict[str, float]]:
+    """Mean absolute errors of cart and block together: of x and y (mm, mm/s, mm/s^2), and of the angles (degrees)."""
+    errors = {q: np.abs(found[q] - truth[q]) for q in DYNAMICS}
+    return {q: by_kind(error) for q, error in errors.items()}
 
 
-def _by_kind(values: np.ndarray) -> dict[str, float]:
+def by_kind(values: np.ndarray) -> dict[str, float]:
     linear, angular = values[..., [0, 1, 3, 4]].mean(), values[..., [2, 5]].mean()
-    return {"linear": float(linear), "angular": float(angular)}
+    return {"linear": 1000 * float(linear), "angular": float(np.degrees(angular))}
 
 
-def tracked(truth: dict[str, np.ndarray]) -> dict[str, float]:
-    """The centroid of what moves against the cart: mean absolute error of x (m), with the best constant offset, and how
-    its velocity correlates with the cart's."""
-    with tempfile.TemporaryDirectory() as folder:
-        add_dynamics(DATASET, Path(folder) / "tracked", track=True, replace=True)
-        found = _read_tracked(Path(folder) / "tracked")
-    x, velocity = found["position"][..., 0] * PIXEL, found["velocity"][..., 0]
-    difference = x - truth["position"][..., 0]
-    correlation = np.corrcoef(velocity.ravel(), truth["velocity"][..., 0].ravel())[0, 1]
-    return {
-        "x_error_m": float(np.abs(difference - np.median(difference)).mean()),
-        "velocity_correlation": float(correlation),
+def derive(position: np.ndarray, method: str) -> Dynamics:
+    """Differentiate positions ``[E, T, D]``."""
+    time = CONTROL_DT * np.arange(position.shape[1])
+    velocity, acceleration = map(
+        np.stack, zip(*(differentiate(p, time, method) for p in position), strict=True)
+    )
+    return dict(zip(DYNAMICS, (position, velocity, acceleration), strict=True))
+
+
+def from_state(truth: Dynamics) -> dict[str, dict]:
+    """Errors of every method and noise."""
+    found = {}
+    for noise in NOISES:
+        scale = noise / 1000 * np.array([1, 1, TURN] * 2)
+        noisy = truth["position"] + scale * np.random.default_rng(0).standard_normal(truth["position"].shape)
+        found |= {f"{method}, {noise} mm": compare(derive(noisy, method), truth) for method in METHODS}
+    return found
+
+
+def from_frames(root: Path, truth: Dynamics) -> dict[str, dict]:
+    """Errors of tracks by every method, and of flow; the centroid against the cart, less the best constant offset."""
+    info = read_info(root)
+    motions = {}
+    for source in ("flow", "centroid"):
+        view = choose_view(root, info, source, planar=True)
+        motions[source] = [
+            motion for _, motion in islice(read_motion(root, info, view), len(truth["position"]))
+        ]
+    position = np.stack([motion.position for motion in motions["flow"]])
+    tracks = {method: derive(position, method) for method in METHODS}
+    velocity = np.stack([motion.velocity for motion in motions["flow"]])
+    flow = {
+        "position": position,
+        "velocity": velocity,
+        "acceleration": derive(velocity, "savgol")["velocity"],
     }
+    found = {f"tracks, {method}": compare(tracks[method], truth) for method in METHODS}
+    found["flow"] = compare(flow, truth)
+    found["lost"] = float(1 - np.mean([motion.found.mean() for motion in motions["flow"]]))
+    point = derive(np.stack([motion.position for motion in motions["centroid"]]), "savgol")
+    rest = {q: point[q] - truth[q][..., :2] for q in DYNAMICS}
+    rest["position"] -= np.median(rest["position"], (0, 1))
+    found["centroid, savgol"] = {q: {"linear": 1000 * float(np.abs(r).mean())} for q, r in rest.items()}
+    return found
 
 
-def _read_tracked(root: Path) -> dict[str, np.ndarray]:
-    episodes = load_dataset(root)["dynamics"]
-    return {name: episodes[name].double().numpy() for name in ("position", "velocity")}
+def measure(root: Path, episodes: int) -> dict:
+    """Errors of all sources on the first episodes of a recording."""
+    dynamics = load_dataset(root)["dynamics"][: episodes or None]
+    truth = {name: values.double().numpy() for name, values in dynamics.items()}
+    size = {q: by_kind(np.abs(truth[q])) for q in DYNAMICS[1:]}
+    return {
+        "episodes": len(dynamics),
+        "mean_magnitude": size,
+        "state": from_state(truth),
+        "frames": from_frames(root, truth),
+    }
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--datasets", default=",".join(f"datasets/{task}" for task in TASKS))
+    parser.add_argument("--episodes", type=int, default=0, help="of each recording; 0 is all")
+    parser.add_argument("--output", type=Path, default=RESULTS)
+    arguments = parser.parse_args()
     torch.set_num_threads(1)
-    dynamics = load_dataset(DATASET)["dynamics"]
-    truth = {name: values.double().numpy() for name, values in dynamics.items()}
     result = {
-        "command": "python tests/benchmarks/derivatives.py",
-        "unit": "m, s, rad; mean absolute errors",
-        "mean_magnitude": {q: _by_kind(np.abs(truth[q])) for q in QUANTITIES},
-        "derived": {
-            f"{method}{', noisy' if noise else ''}": derived(truth, method, noise)
-            for method in ("central", "savgol")
-            for noise in (0, 1)
-        },
-        "tracked": tracked(truth),
+        "command": shlex.join(["python", "tests/benchmarks/derivatives.py", *sys.argv[1:]]),
+        "commit": find_commit(),
+        "unit": "mm, s, degrees; mean absolute errors",
     }
-    write_json(RESULTS, result)
-    print(RESULTS.read_text())
+    for dataset in map(Path, arguments.datasets.split(",")):
+        result[dataset.name] = measure(dataset, arguments.episodes)
+        write_json(arguments.output, result)
+    print(arguments.output.read_text())
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ COMMANDS = {
     "evaluate": [],
     "latent_ppo": [*SHIPPED, "--run", "latent_ppo", "--ppo.iterations", "3"],
     "probe": ["--runs", "balance_reaching"],
-    "add_dynamics": ["--dataset", str(DATASET), "--track", "--replace", "--output", "tracked"],
+    "add_dynamics": ["--dataset", str(DATASET), "--source", "tracks", "--replace", "--output", "tracked"],
     "paper/figures": ["--only", "fig2,fig4"],
     "play": ["--policy", "balance_reaching", "--steps", "240", "--gif", "film.gif"],
 }

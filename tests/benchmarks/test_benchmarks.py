@@ -17,7 +17,7 @@ from dynmap_rl.keys import DYNAMICS
 from dynmap_rl.modules.checkpoints import make_world_model
 from dynmap_rl.objectives.world_model import WorldModelLoss
 from dynmap_rl.utils.cli import parse_settings, read_arguments
-from dynmap_rl.utils.files import write_json
+from dynmap_rl.utils.files import read_json, write_json
 
 SMALL = {
     "control_step": {},
@@ -158,6 +158,19 @@ def test_updates_are_measured(load):
     row = updates.measure(cpu, 2, mixed=False, compiled=False, repeats=1, peak=peak)
     assert 0 < row["share_of_convolution_peak"] < 1 and row["frames_per_s"] > 0
     assert sum(row["breakdown"].values()) == pytest.approx(1) and row["breakdown"]["convolution"] > 0
+
+
+@pytest.mark.slow
+def test_errors_of_derived_dynamics_grow_with_noise(load, recording, tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        "sys.argv",
+        ["x.py", "--datasets", str(recording), "--episodes", "2", "--output", str(tmp_path / "found.json")],
+    )
+    load("derivatives").main()
+    found = read_json(tmp_path / "found.json")[recording.name]
+    errors = [found["state"][f"savgol, {noise} mm"]["velocity"]["linear"] for noise in (0, 2, 5, 10)]
+    assert errors == sorted(errors) and found["state"]["central, 0 mm"]["position"]["linear"] == 0
+    assert found["frames"]["tracks, savgol"]["position"]["linear"] < 15 and found["episodes"] == 2
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """Augmentations are symmetries of the scene."""
 
 import numpy as np
+import pytest
 import torch
 
 from dynmap_rl.data.augmentation import augment
@@ -63,3 +64,14 @@ def test_options_leave_the_other_changes_as_they_are():
     assert torch.equal(every["pixels"].sum(2), same_colors["pixels"].sum(2)), "channels are permuted"
     off = augment(episodes, torch.Generator(), max_shift=0, mirror=False, recolor=False)
     assert (off == episodes.select(*off.keys())).all()
+
+
+@pytest.mark.parametrize("size", [2, 3])
+def test_a_point_and_a_single_body_change_like_the_first_of_two_bodies(size):
+    episodes = make_episodes()
+    few = episodes.clone()
+    few["dynamics"] = few["dynamics"].apply(lambda x: x[..., :size])
+    out, expected = (augment(td, torch.Generator().manual_seed(2)) for td in (few, episodes))
+    for quantity, values in out["dynamics"].items():
+        assert torch.equal(values, expected["dynamics", quantity][..., :size])
+    assert not torch.equal(out["dynamics", "position"], few["dynamics", "position"])

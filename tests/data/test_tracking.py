@@ -1,21 +1,91 @@
-"""Positions from frames."""
+"""Positions and angles from frames."""
 
 import numpy as np
 import pytest
+from films import film, make_poses
 from robot_dataset import draw
 
-from dynmap_rl.data.tracking import track_centroid
+from dynmap_rl.data.flow import flow_velocity
+from dynmap_rl.data.tracking import fill_gaps, track_centroid, track_objects
+
+SIZE = 96
+
+
+def truth(poses):
+    return poses * [SIZE, SIZE, 1] - [0.5, 0.5, 0]
 
 
 def test_a_square_is_found_to_half_a_pixel_though_it_rests_for_most_of_the_time():
     way = np.linspace(0.2, 0.8, 40)
     positions = np.stack([np.concatenate([way, np.full(100, 0.8)]), np.full(140, 0.5)], 1)
-    track = track_centroid(np.stack([draw(p) for p in positions]))
+    track, _ = track_centroid(np.stack([draw(p) for p in positions]))
     error = np.abs(track[:, 0] - (positions[:, 0] * 128 - 0.5))
     assert error[5:35].max() < 1.5  # where it neither starts nor ends, in the background
     assert np.median(error) < 1.5
 
 
-def test_a_picture_in_which_nothing_moves_is_refused():
-    with pytest.raises(ValueError, match="nothing moves"):
-        track_centroid(np.stack([draw(np.array([0.5, 0.5]))] * 10))
+@pytest.mark.parametrize("noise", [0.0, 6.0])
+@pytest.mark.parametrize("extent", [0.5, 0.15])
+def test_objects_are_found_with_their_angles_also_where_they_rest(extent, noise):
+    """With a motion that is shorter than the lying bar, whose middle is never seen without it."""
+    poses = make_poses(extent=extent)
+    tracks = track_objects(film(poses, SIZE, noise=noise), 2)
+    assert tracks.found.all() and not tracks.cut.any()
+    error = np.abs(tracks.pose - truth(poses))
+    assert error[..., :2].max() < 1.5 and error[..., :2].mean() < 0.5
+    assert error[..., 2].mean() < 0.05
+
+
+def test_velocities_by_flow_are_those_of_the_motion():
+    poses = make_poses(120)
+    frames = film(poses, SIZE)
+    velocity, expected = flow_velocity(frames, track_objects(frames, 2)), np.gradient(truth(poses), axis=0)
+    for n in range(2):
+        assert np.corrcoef(velocity[:, n, 0], expected[:, n, 0])[0, 1] > 0.9
+    assert np.abs(velocity - expected)[..., :2].mean() < 0.4 * np.abs(expected[..., :2]).mean()
+
+
+def test_an_object_that_is_hidden_is_interpolated():
+    poses = make_poses()
+    frames = film(poses, SIZE)
+    hidden = slice(20, 25)
+    frames[hidden] = film(poses[hidden], SIZE, bodies=[0])
+    tracks = track_objects(frames, 2)
+    assert tracks.found[:, 0].all() and np.flatnonzero(~tracks.found[:, 1]).tolist() == list(range(20, 25))
+    assert np.abs(tracks.pose - truth(poses))[hidden, :, :2].max() < 3
+
+
+def test_an_object_that_leaves_for_most_of_the_film_is_still_an_object():
+    poses = make_poses()
+    frames = np.concatenate([film(poses[:24], SIZE), film(poses[24:], SIZE, bodies=[0])])
+    tracks = track_objects(frames, 2)
+    assert tracks.found[:, 0].all() and np.array_equal(tracks.found[:, 1], np.arange(60) < 24)
+
+
+def test_the_order_of_the_objects_is_the_chosen_one():
+    frames = film(make_poses(), SIZE, colors=((60, 20, 20), (120, 120, 200)))
+    heights = {sort: track_objects(frames, 2, sort=sort).pose[0, :, 1] for sort in ("lowest", "brightest")}
+    assert np.array_equal(heights["lowest"], heights["brightest"][::-1])
+    labels = track_objects(frames, 2, sort="brightest").labels
+    assert frames[labels == 1].mean() > frames[labels == 2].mean()
+
+
+def test_gaps_are_filled_linearly_and_at_the_ends_with_the_nearest_value():
+    values, found = np.array([[9.0], [1.0], [9.0], [3.0], [9.0]]), np.array([0, 1, 0, 1, 0], bool)
+    assert fill_gaps(values, found)[:, 0].tolist() == [1, 1, 2, 3, 3]
+
+
+@pytest.mark.parametrize(
+    ("frames", "objects", "message"),
+    [
+        (np.stack([draw(np.array([0.5, 0.5]))] * 10), 1, "nothing moves"),
+        (film(make_poses(), SIZE, bodies=[0]), 2, "2 objects .* fewer --objects"),
+        (film(make_poses(), SIZE, background=lambda t: 40 + 3 * t), 1, "camera must stand still"),
+    ],
+)
+def test_what_cannot_be_tracked_is_refused(frames, objects, message):
+    with pytest.raises(ValueError, match=message):
+        track_objects(frames, objects)
+    if message == "nothing moves":
+        with pytest.raises(ValueError, match=message):
+            track_centroid(frames)

@@ -76,9 +76,28 @@ def test_weights_scale_their_terms():
     torch.manual_seed(1)
     td = batch()
     _, plain = make(("position",), beta_z=1.0, beta_dynamics=1.0)
-    _, heavy = make(("position",), beta_z=2.0, beta_dynamics=3.0)
+    _, heavy = make(("position",), beta_z=2.0, beta_dynamics=3.0, beta_rgb=4.0)
+    torch.testing.assert_close(heavy(td)["loss_rgb"], 4 * plain(td)["loss_rgb"])
     torch.testing.assert_close(heavy(td)["loss_latent"], 2 * plain(td)["loss_latent"])
     torch.testing.assert_close(heavy(td)["loss_position"], 3 * plain(td)["loss_position"])
+
+
+def test_the_loss_of_the_dynamics_is_the_mean_over_the_labelled_steps():
+    td = batch(b=3)
+    _, loss = make(("position",))
+    alone = loss(td[:1])["loss_position"]
+    td["labelled"] = torch.tensor([True, False, False])[:, None, None].expand(3, 5, 1)
+    found = loss(td)
+    torch.testing.assert_close(found["loss_position"], alone)
+    td["labelled"] = torch.zeros(3, 5, 1, dtype=torch.bool)
+    none = loss(td)
+    assert none["loss_position"] == 0 and none["loss_latent"] == found["loss_latent"]
+
+
+def test_without_the_rgb_loss_no_frame_is_decoded():
+    model, loss = make(("position",), beta_rgb=0.0)
+    model.decode_pixels = None
+    assert set(loss(batch()).keys()) == set(loss.out_keys) == {"loss_latent", "loss_position"}
 
 
 def test_rarity_makes_an_error_on_a_small_object_count():

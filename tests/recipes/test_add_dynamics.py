@@ -15,7 +15,7 @@ import torch
 from commands import run
 from robot_dataset import CAMERA, FPS, make_robot_dataset
 
-from dynmap_rl.data.demonstrations import load_dataset
+from dynmap_rl.data.demonstrations import find_meta, load_dataset, load_demonstrations, load_meta
 from recipes.add_dynamics import Config, main
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "add_dynamics.py"
@@ -167,11 +167,70 @@ def test_derived_dynamics_of_our_recordings_are_near_the_simulators(recording, t
 
 
 def test_positions_from_the_frames(videos, tmp_path):
-    main(Config(dataset=str(videos[0]), output=tmp_path / "tracked", track=True))
+    main(Config(dataset=str(videos[0]), output=tmp_path / "tracked", source="centroid"))
     position, state = read(tmp_path / "tracked", "dynamics.position"), read(videos[0], "observation.state")
     assert open_with_lerobot(tmp_path / "tracked").meta.features["dynamics.position"]["names"] == ["x", "y"]
     error = np.abs(position - (state[:, :2] * [128, 96] - 0.5))
     assert np.median(error) < 1.5 and error.mean() < 4, "pixels; the place that is background is not found"
+
+
+def test_tracks_of_a_recording_are_in_its_units_and_it_stays_a_recording(recording, tmp_path, folder_of_runs):
+    """Cart and block to some mm and degrees, and their velocities by tracks and by flow to a part of their size."""
+    truth, velocities = load_dataset(recording)["dynamics"], {}
+    for source in ("tracks", "flow"):
+        main(Config(dataset=str(recording), output=tmp_path / source, source=source, replace=True))
+        found = load_dataset(tmp_path / source)["dynamics"]
+        error = (found["position"] - truth["position"]).abs().mean((0, 1))
+        assert error[[0, 1, 3, 4]].max() < 0.01 and error[[2, 5]].max() < 0.1
+        velocities[source] = found["velocity"]
+        error = (found["velocity"] - truth["velocity"]).abs().mean()
+        assert error < 0.7 * truth["velocity"].abs().mean()
+    assert not torch.equal(*velocities.values())
+    before, after = load_meta(recording), load_meta(tmp_path / "tracks")
+    assert after["episodes"] == before["episodes"] and "layout" not in after
+    assert after["normalization"]["action"] == before["normalization"]["action"]
+    flow, quality = (
+        json.loads((folder_of_runs / source / "quality.json").read_text()) for source in ("flow", "tracks")
+    )
+    assert quality["checks"]["agreement"]["good"] and quality["command"]
+    agreement = pytest.approx(quality["checks"]["agreement"]["value"])
+    assert flow["checks"]["agreement"]["value"] == agreement, "the same two velocities"
+    page = (folder_of_runs / "tracks/report.html").read_text()
+    assert f"derived columns: {quality['verdict']}" in page and page.count("data:image/") == 3
+
+
+@pytest.mark.parametrize(
+    ("settings", "names"),
+    [
+        ({"columns": "0,1,2", "angles": "2"}, ["cart_x", "cart_y", "cart_theta"]),
+        ({"source": "centroid"}, ["x", "y"]),
+    ],
+)
+def test_a_recording_with_fewer_entries_loads_with_constants_of_their_own(
+    recording, tmp_path, settings, names
+):
+    main(Config(dataset=str(recording), output=tmp_path / "few", replace=True, **settings))
+    episodes, constants = load_demonstrations(tmp_path / "few")
+    assert episodes["train"]["dynamics", "velocity"].shape == (4, 120, len(names))
+    assert len(constants["velocity"]["low"]) == len(names)
+    assert load_meta(tmp_path / "few")["layout"]["position"] == names
+
+
+def test_entries_that_are_no_bodies_end_a_recording(recording, tmp_path):
+    main(Config(dataset=str(recording), output=tmp_path / "angle", replace=True, columns="2", angles="2"))
+    assert find_meta(tmp_path / "angle") is None
+
+
+def test_noise_is_seeded_and_has_the_given_size(recording, tmp_path):
+    settings = {"dataset": str(recording), "state": "dynamics.position", "angles": "2,5", "replace": True}
+    found = []
+    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+        noise = {"noise": 0.005, "angle_noise": 0.02, "noise_seed": seed}
+        main(Config(**settings, **noise, output=tmp_path / name))
+        found.append(read(tmp_path / name, "dynamics.position"))
+    assert np.array_equal(found[0], found[1]) and not np.array_equal(found[0], found[2])
+    error = (found[0] - read(recording, "dynamics.position")).std(0)
+    assert np.allclose(error, [0.005, 0.005, 0.02] * 2, rtol=0.15)
 
 
 def test_one_entry_is_a_column_of_numbers(images, tmp_path):
@@ -204,11 +263,18 @@ def test_a_killed_run_leaves_nothing_that_looks_done(images, tmp_path):
         ({"method": "spline"}, "--method"),
         ({"method": "savgol", "window": 4}, "--window"),
         ({"method": "savgol", "window": 25}, "24"),
-        ({"track": True, "camera": "front"}, "--camera .*observation.images.top.*'front'"),
+        ({"source": "centroid", "camera": "front"}, "--camera .*observation.images.top.*'front'"),
         ({"dataset": "no/where/here"}, "no/where/here"),
         ({"dataset": None}, "--dataset"),
-        ({"track": True, "columns": "0"}, "--columns has no effect with --track"),
-        ({"camera": "observation.images.top"}, "--camera has no effect with.*--track"),
+        ({"source": "tracks", "columns": "0"}, "--columns has no effect with --source tracks"),
+        ({"camera": "observation.images.top"}, "--camera has no effect with --source state"),
+        ({"source": "radar"}, "--source .*'radar'"),
+        ({"source": "tracks", "objects": 0}, "--objects"),
+        ({"source": "centroid", "objects": 2}, "--objects has no effect with --source centroid"),
+        ({"source": "tracks", "sort": "oldest"}, "--sort .*'oldest'"),
+        ({"source": "tracks", "noise": 0.1}, "--noise has no effect"),
+        ({"source": "tracks", "width": -1.0}, "--width"),
+        ({"noise": -1.0}, "--noise"),
     ],
 )
 def test_bad_input_is_refused_before_anything_is_written(images, tmp_path, settings, message):

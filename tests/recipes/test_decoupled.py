@@ -6,6 +6,9 @@ import shutil
 import pytest
 from commands import PRESETS, run, run_small
 
+from dynmap_rl.data.derive import add_dynamics
+from dynmap_rl.modules.checkpoints import load_world_model
+from dynmap_rl.runs.folder import read_metrics
 from dynmap_rl.training.settings import WorldModelTraining
 from dynmap_rl.utils.files import read_json, write_json
 
@@ -112,3 +115,22 @@ def test_other_tasks(recordings, tmp_path, task):
     assert (evaluation["task"], evaluation["row"]) == (task, "RGB+[P+V]")
     assert evaluation["world_model"] == {"task": task, "training": "decoupled"}
     assert "  paper " not in result.stdout, "its world models are of task 1"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "settings", [{"source": "centroid"}, {"columns": [0, 1, 2], "angles": [2]}], ids=["centroid", "command"]
+)
+def test_a_recording_with_other_dynamics_trains_and_is_evaluated(recording, tmp_path, settings):
+    """With two and with three entries in the place of six, partly labelled and without the RGB loss."""
+    add_dynamics(recording, tmp_path / "other", **settings, replace=True)
+    options = "--world_model.labelled", "0.5", "--world_model.beta_rgb", "0"
+    run_small(tmp_path, "decoupled", "--dataset", tmp_path / "other", "--run", "run", *options, pictures=True)
+    result = read_json(tmp_path / "run/eval.json")
+    assert result["row"] == "RGB+[P+V]" and "localization" not in result["test_protocol"]
+    assert load_world_model(tmp_path / "run/world_model").dynamics_decoder.normalizers["position"].size in (
+        2,
+        3,
+    )
+    assert {"error_position", "error_rgb"} <= read_metrics(tmp_path / "run")[-1].keys()
+    assert (tmp_path / "run/figures/dynamics.png").exists()

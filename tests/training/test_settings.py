@@ -31,6 +31,9 @@ def test_settings_are_frozen_and_hashable(kind):
         (WorldModelTraining, {"updates": 0}),
         (WorldModelTraining, {"window_steps": 1}),
         (WorldModelTraining, {"learning_rate": -1e-3}),
+        (WorldModelTraining, {"labelled": 1.1}),
+        (WorldModelTraining, {"labelled": -0.1}),
+        (WorldModelTraining, {"beta_rgb": -1}),
         (PolicyTraining, {"kind": "transformer"}),
         (PolicyTraining, {"corrections": -1}),
         (JointTraining, {"beta_joint": -1}),
@@ -46,6 +49,11 @@ def test_a_bad_value_is_refused_and_named(kind, values):
     [(name, value)] = values.items()
     with pytest.raises(ValueError, match=rf"\.{name} must .*{value}"):
         kind(**values)
+
+
+def test_a_world_model_that_would_learn_nothing_is_refused():
+    with pytest.raises(ValueError, match=r"beta_rgb must be above 0"):
+        WorldModelTraining(supervision="none", beta_rgb=0)
 
 
 def test_torch_is_not_imported():

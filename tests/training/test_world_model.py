@@ -1,8 +1,10 @@
 """Training of a world model, called as in a notebook."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
+import torch
 from small import CONSTANTS, WORLD_MODEL, make_episodes, make_model
 
 from dynmap_rl.runs.folder import read_metrics
@@ -12,6 +14,7 @@ from dynmap_rl.training import (
     build_world_model,
     train_world_model,
 )
+from dynmap_rl.training.world_model import choose_labelled
 from dynmap_rl.utils.weights import fingerprint
 
 
@@ -37,7 +40,17 @@ def test_errors_of_every_entry_on_request(tmp_path):
     assert {f"error_position_{i}" for i in range(6)} < read_metrics(tmp_path)[-1].keys()
 
 
-@pytest.mark.parametrize("changes", [{"seed": 1}, {"beta_z": 0.0}, {"beta_dynamics": 0.0}, {"rgb_frames": 1}])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"seed": 1},
+        {"beta_z": 0.0},
+        {"beta_dynamics": 0.0},
+        {"rgb_frames": 1},
+        {"beta_rgb": 0.5},
+        {"labelled": 0.4},
+    ],
+)
 def test_every_setting_has_an_effect(tmp_path, changes):
     models = make_model(), make_model()
     for model, settings in zip(models, (WORLD_MODEL, replace(WORLD_MODEL, **changes)), strict=True):
@@ -45,3 +58,40 @@ def test_every_setting_has_an_effect(tmp_path, changes):
             model, make_episodes(), tmp_path / str(settings == WORLD_MODEL), replace(settings, updates=2)
         )
     assert fingerprint(models[0]) != fingerprint(models[1])
+
+
+def test_dynamics_of_unlabelled_episodes_have_no_effect_and_others_have(tmp_path):
+    settings, weights = replace(WORLD_MODEL, labelled=0.4), []
+    for spoiled in ("none", "unlabelled", "labelled"):
+        episodes, model = make_episodes(), make_model()
+        if spoiled != "none":
+            known = choose_labelled(episodes["train"], 0.4, settings.seed)
+            other = known if spoiled == "labelled" else ~known
+            episodes["train"] = episodes["train"].clone()
+            position = episodes["train"]["dynamics", "position"]
+            episodes["train"]["dynamics", "position"] = torch.where(other, 5.0, position)
+        train_world_model(model, episodes, tmp_path / spoiled, settings)
+        weights.append(fingerprint(model))
+    assert weights[0] == weights[1] != weights[2]
+
+
+def test_labelled_episodes_are_whole_seeded_and_nested():
+    episodes = make_episodes(20)["train"]
+    draws = [choose_labelled(episodes, share, 3) for share in (0.01, 0.25, 0.5, 1.0)]
+    assert [int(draw[:, 0].sum()) for draw in draws] == [1, 5, 10, 20]
+    assert all((draw == draw[:, :1]).all() for draw in draws)
+    assert all((large | ~small).all() for small, large in pairwise(draws))
+    assert not torch.equal(draws[1], choose_labelled(episodes, 0.25, 4))
+    pieces = torch.cat([episodes, episodes]).set(
+        "episode", torch.arange(20).repeat(2)[:, None, None].expand(40, 12, 1)
+    )
+    draw = choose_labelled(pieces, 0.25, 3)
+    assert torch.equal(draw[:20], draw[20:]) and int(draw[:20, 0].sum()) == 5
+
+
+def test_without_the_rgb_loss_the_decoder_of_frames_is_not_trained(tmp_path):
+    model = make_model()
+    before = [p.clone() for p in model.image_decoder.parameters()]
+    train_world_model(model, make_episodes(), tmp_path, replace(WORLD_MODEL, beta_rgb=0.0))
+    assert all(torch.equal(a, b) for a, b in zip(before, model.image_decoder.parameters(), strict=True))
+    assert "loss_rgb" not in read_metrics(tmp_path)[-1] and "loss_position" in read_metrics(tmp_path)[-1]

@@ -28,7 +28,7 @@ def write_columns(
     table: pa.Table,
     values: dict[str, np.ndarray],
     names: list[str],
-    without: tuple[str, ...] = (),
+    replaced: dict[str, dict | None] | None = None,
 ) -> None:
     """Copy a dataset with new or replaced columns to a new folder, which appears when it is complete.
 
@@ -39,17 +39,18 @@ def write_columns(
         table: ``index`` and ``episode_index`` of all frames, in order.
         values: new columns, float32 ``[N, D]``, by name.
         names: names of the D entries.
-        without: files that are left out, relative to ``root``.
+        replaced: content of JSON files by their paths relative to ``root``, in the place of the dataset's own; None
+            leaves a file out.
 
     Raises:
         OSError: the folder cannot be written.
     """
-    temporary = output.with_name(f"{output.name}.tmp")
+    temporary, replaced = output.with_name(f"{output.name}.tmp"), replaced or {}
     try:
         shutil.rmtree(temporary, ignore_errors=True)
         for file in sorted(path for path in root.rglob("*") if path.is_file()):
             relative = file.relative_to(root)
-            if relative.parts[0].startswith(".") or str(relative) in without:
+            if relative.parts[0].startswith(".") or str(relative) in replaced:
                 continue  # names with a dot are the hub's notes on a download
             target = temporary / relative
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -65,6 +66,9 @@ def write_columns(
         features = {name: {"dtype": "float32", "shape": shape, "names": names} for name in values}
         write_json(temporary / "meta" / "info.json", info | {"features": info["features"] | features})
         _write_stats(temporary / "meta" / "stats.json", values)
+        for name, content in replaced.items():
+            if content is not None:
+                write_json(temporary / name, content)
         temporary.replace(output)
     except OSError as error:
         raise OSError(

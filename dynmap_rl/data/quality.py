@@ -1,0 +1,200 @@
+"""Quality of derived dynamics columns, estimated without the truth, and what to film differently.
+
+Every check has a value, a limit, and advice. The limits (:data:`LIMITS`) were chosen by hand. They tell synthetic films and
+positions with one known fault from those without (``tests/data/test_quality.py``); whether they predict the success of a
+policy has not been measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .sources import Motion
+
+SMOOTH = 7, 2  # window and order of the smooth trajectory
+
+# name: (limit, whether larger is worse, what is measured, advice)
+LIMITS = {
+    "lost": (
+        0.05, True, "share of the frames in which an object is not found",
+        "keep the object in view and unlike its surroundings in colour, or choose another --objects or --threshold",
+    ),
+    "cut": (
+        0.05, True, "share of the frames in which an object touches the border of the picture",
+        "film from farther away, so that the object never leaves the picture",
+    ),
+    "size": (
+        4.0, False, "side of a square as large as the object, in pixels of a picture at most 160 wide",
+        "film from nearer, or with less around the scene",
+    ),
+    "background": (
+        0.5, True, "share of the picture that changes in an episode",
+        "fix the camera, and remove what moves in the background; the light must not change",
+    ),
+    "step": (
+        0.5, True, "motion of an object between two frames, 99th percentile, in sizes of the object",
+        "film at a higher frame rate, or move more slowly",
+    ),
+    "jumps": (
+        0.005, True, "share of the steps in which a position jumps by more than a quarter of its extent",
+        "look at the frames there: the track has gone to another object, or the sensor failed",
+    ),
+    "residual": (
+        0.02, True, "distance from a smooth trajectory, root mean square, as a share of the extent of the motion",
+        "use --method savgol with a longer --window; a position is noisy, or the picture too coarse",
+    ),
+    "residual_angle": (
+        0.07, True, "distance of an angle from a smooth trajectory, root mean square (rad)",
+        "use --method savgol with a longer --window, or leave the angle out; a round or small object has none",
+    ),
+    "agreement": (
+        0.7, False, "correlation of the tracks' velocity with that of the optical flow",
+        "look at the picture of the tracks; velocities are not reliable",
+    ),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Derived:
+    """Dynamics of an episode as they are written.
+
+    Attributes:
+        episode: index of the episode.
+        position: ``[T, D]``.
+        velocity: ``[T, D]``.
+        motion: what the source measured.
+    """
+
+    episode: int
+    position: np.ndarray
+    velocity: np.ndarray
+    motion: Motion
+
+
+def judge_quality(episodes: Sequence[Derived], names: Sequence[str]) -> dict:
+    """Measure the quality of derived columns.
+
+    Args:
+        episodes: all episodes of the dataset.
+        names: names of the entries.
+
+    Returns:
+        JSON values: ``verdict``, ``good`` or ``doubtful`` (a check fails); ``checks``, a dict by the names of
+        :data:`LIMITS` of those that the source allows, each with ``value`` (of the worst object or entry), ``limit``,
+        ``good``, ``where`` (that object or entry), ``episode`` (the worst one), ``what`` and ``advice``.
+    """
+    rows = [_measure(episode, names) for episode in episodes]
+    checks = {}
+    for name, (limit, more, what, advice) in LIMITS.items():
+        found = [row[name] for row in rows if row.get(name)]
+        if not found:
+            continue
+        sign = 1 if more else -1
+        means = {where: float(np.mean([row[where] for row in found])) for where in found[0]}
+        where = max(means, key=lambda key, means=means, sign=sign: sign * means[key])
+        worst = max(
+            range(len(found)), key=lambda i, found=found, where=where, sign=sign: sign * found[i][where]
+        )
+        checks[name] = {
+            "value": means[where],
+            "limit": limit,
+            "good": sign * means[where] <= sign * limit,
+            "where": where,
+            "episode": episodes[worst].episode,
+            "what": what,
+            "advice": advice,
+        }
+    good = all(check["good"] for check in checks.values())
+    return {"verdict": "good" if good else "doubtful", "checks": checks}
+
+
+def quality_text(quality: dict) -> str:
+    """Return the result of :func:`judge_quality` as lines of text."""
+    lines = [f"derived columns: {quality['verdict']}"]
+    for name, check in quality["checks"].items():
+        relation = "at most" if LIMITS[name][1] else "at least"
+        mark = "ok  " if check["good"] else "BAD "
+        lines.append(
+            f"  {mark} {name:14} {check['value']:8.3g}   ({relation} {check['limit']:g}; {check['where']}, worst in "
+            f"episode {check['episode']}): {check['what']}"
+        )
+    lines += [
+        f"  to do, {name}: {check['advice']}"
+        for name, check in quality["checks"].items()
+        if not check["good"]
+    ]
+    return "\n".join(lines)
+
+
+def _measure(episode: Derived, names: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Return every measure of an episode by object or entry."""
+    position, motion = episode.position, episode.motion
+    lines = [i for i in range(position.shape[1]) if i not in motion.angles]
+    extent = np.quantile(position, 0.95, 0) - np.quantile(position, 0.05, 0)
+    extent = max(extent[lines].max(initial=0.0), 1e-9)
+    rest = position - _smooth(position)
+    rms = np.sqrt(np.square(rest).mean(0))
+    result = {
+        "residual": {names[i]: rms[i] / extent for i in lines},
+        "residual_angle": {names[i]: rms[i] * 2 * np.pi / motion.period for i in motion.angles},
+        "jumps": {names[i]: _jumps(position[:, i], extent) for i in lines},
+    }
+    if motion.found is not None:
+        bodies = _bodies(names, motion.found.shape[1])
+        result["lost"] = dict(zip(bodies, 1 - motion.found.mean(0), strict=True))
+    if (tracks := motion.tracks) is None:
+        return result
+    size = np.sqrt([np.median(area[area > 0]) for area in tracks.area.T])
+    step = np.linalg.norm(np.diff(tracks.pose[..., :2], axis=0), axis=-1)
+    result["cut"] = dict(zip(bodies, tracks.cut.mean(0), strict=True))
+    result["size"] = dict(zip(bodies, size, strict=True))
+    result["step"] = dict(zip(bodies, np.quantile(step, 0.99, axis=0) / size, strict=True))
+    result["background"] = {"picture": tracks.moving}
+    if motion.other is not None:
+        result["agreement"] = {
+            body: _correlation(*(v[:, 3 * n : 3 * n + 2] for v in (episode.velocity, motion.other)))
+            for n, body in enumerate(bodies)
+        }
+    return result
+
+
+def _bodies(names: Sequence[str], count: int) -> list[str]:
+    """Return the names of the objects, which begin those of their entries."""
+    if count == 1:
+        return [names[0].rpartition("_")[0] or "all that moves"]
+    return [names[3 * n].rpartition("_")[0] for n in range(count)]
+
+
+def _smooth(position: np.ndarray) -> np.ndarray:
+    from scipy.signal import savgol_filter
+
+    window, order = SMOOTH
+    return savgol_filter(position, window, order, axis=0) if len(position) >= window else position
+
+
+def _jumps(values: np.ndarray, extent: float) -> float:
+    """Return the share of the steps that are larger than a quarter of the extent and three times their neighbours."""
+    from scipy.ndimage import median_filter
+
+    step = np.abs(np.diff(values))
+    return float(((step > 0.25 * extent) & (step > 3 * median_filter(step, 7))).mean())
+
+
+def _correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the correlation of two velocities ``[T, 2]`` about 0; 1 where neither is anything but 0."""
+    norm = np.sqrt(np.square(a).sum() * np.square(b).sum())
+    return float((a * b).sum() / norm) if norm else 1.0
+
+
+def worst_episode(quality: dict) -> int:
+    """Return the episode in which the check that is farthest beyond its limit, or nearest to it, is worst."""
+
+    def excess(item: tuple[str, dict]) -> float:
+        name, check = item
+        ratio = check["value"] / check["limit"]
+        return ratio if LIMITS[name][1] else 2 - ratio
+
+    return max(quality["checks"].items(), key=excess)[1]["episode"]

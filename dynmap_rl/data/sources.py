@@ -1,0 +1,180 @@
+"""Sources of positions for datasets without dynamics: columns of a state, or the frames alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from dynmap_rl.envs.task import BODIES
+
+from .flow import flow_velocity
+from .format.frames import choose_camera, iterate_frames
+from .tracking import SORTS, WIDEST, Tracks, track_centroid, track_objects
+
+SOURCES = "state", "centroid", "tracks", "flow"
+BODY = "x", "y", "theta"
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What a source measures in an episode of T steps.
+
+    Attributes:
+        position: ``[T, D]``, float64.
+        angles: entries that are angles.
+        period: period of the angles: 2 pi for radians, 360 for degrees.
+        velocity: ``[T, D]`` per s, where the source measures it itself; None is to be derived.
+        other: a second measurement of the velocity ``[T, D]`` that was not used, for comparison, or None.
+        found: bool ``[T, N]``, whether each object was found in the frame; None for a state.
+        tracks: the objects, for the sources that segment them.
+    """
+
+    position: np.ndarray
+    angles: list[int]
+    period: float = 2 * np.pi
+    velocity: np.ndarray | None = None
+    other: np.ndarray | None = None
+    found: np.ndarray | None = None
+    tracks: Tracks | None = None
+
+    def light(self) -> Motion:
+        """Return the same without the masks, which are as large as the frames."""
+        return replace(self, tracks=replace(self.tracks, labels=None)) if self.tracks else self
+
+
+@dataclass(frozen=True)
+class Camera:
+    """How frames are turned into positions.
+
+    Attributes:
+        source: ``centroid`` (see :func:`dynmap_rl.data.tracking.track_centroid`), ``tracks`` (see
+            :func:`dynmap_rl.data.tracking.track_objects`) or ``flow`` (tracks, and velocities by
+            :func:`dynmap_rl.data.flow.flow_velocity`).
+        column: the camera's column.
+        objects: number of objects, for ``tracks`` and ``flow``.
+        threshold: smallest difference of a colour channel, 0 to 255, of a pixel that moves.
+        sort: order of the objects.
+        width: width of the picture (m). Positions are then in m from its lower left corner, y up, and angles
+            counterclockwise. Without it they are pixels of the full frame, y down, and angles clockwise.
+    """
+
+    source: str
+    column: str
+    objects: int = 1
+    threshold: int = 30
+    sort: str = "lowest"
+    width: float | None = None
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the entries of the position."""
+        if self.source == "centroid":
+            return ["x", "y"]
+        return [f"object{n}_{name}" for n in range(1, self.objects + 1) for name in BODY]
+
+
+def choose_view(
+    root: Path,
+    info: dict,
+    source: str,
+    planar: bool = False,
+    *,
+    camera: str | None = None,
+    objects: int | None = None,
+    threshold: int = 30,
+    sort: str = "lowest",
+    width: float | None = None,
+) -> Camera:
+    """Return how frames are read.
+
+    Args:
+        root: folder of the dataset, for messages.
+        info: content of its ``meta/info.json``.
+        source: ``centroid``, ``tracks`` or ``flow``.
+        planar: whether the dataset is a recording of cart and block, whose picture is 1 m wide and shows two objects.
+        camera: the camera's column; by default the first one.
+        objects: see :class:`Camera`, also for the next; by default two for a planar recording, otherwise one.
+        threshold: smallest difference of a pixel that moves.
+        sort: order of the objects.
+        width: width of the picture (m); by default 1 for a planar recording, otherwise None.
+
+    Raises:
+        ValueError: an argument is wrong.
+    """
+    if objects is not None and source == "centroid":
+        raise ValueError("--objects has no effect with --source centroid; leave it out")
+    if objects is None:
+        objects = len(BODIES) // 3 if planar and source != "centroid" else 1
+    if objects < 1 or not 0 < threshold < 256:
+        raise ValueError(
+            f"--objects must be at least 1 and --threshold 1 to 255, got {objects} and {threshold}"
+        )
+    if sort not in SORTS:
+        raise ValueError(f"--sort must be one of {', '.join(SORTS)}, got {sort!r}")
+    width = 1.0 if width is None and planar else width
+    if width is not None and width <= 0:
+        raise ValueError(f"--width must be above 0, got {width}")
+    return Camera(source, choose_camera(root, info, camera), objects, threshold, sort, width)
+
+
+def read_motion(root: Path, info: dict, camera: Camera) -> Iterator[tuple[int, Motion]]:
+    """Iterate over the episodes' motions as a camera sees them.
+
+    Args:
+        root: folder of the dataset.
+        info: content of its ``meta/info.json``.
+        camera: source and its settings.
+
+    Raises:
+        ValueError: a file is damaged, or what should be tracked is not found; the message names the episode.
+    """
+    fps = info.get("fps") or 1
+    for episode, frames, factor in iterate_frames(root, info, camera.column, widest=WIDEST):
+        try:
+            yield episode, measure(frames, factor, camera, fps)
+        except ValueError as error:
+            raise ValueError(f"{root}: in episode {episode} {error}") from error
+
+
+def measure(frames: np.ndarray, factor: float, camera: Camera, fps: float) -> Motion:
+    """Measure the motion in one episode.
+
+    Args:
+        frames: uint8 ``[T, height, width, 3]``.
+        factor: ratio of the full width to that of the frames.
+        camera: source and its settings.
+        fps: frames per second.
+
+    Raises:
+        ValueError: what should be tracked is not found. The message is the end of a sentence.
+    """
+    height, width = frames.shape[1:3]
+    if camera.source == "centroid":
+        centroid, found = track_centroid(frames, camera.threshold)
+        place, scale = _scale(height, width, factor, camera.width, 2)
+        return Motion(place(centroid), [], found=found[:, None])
+    tracks = track_objects(frames, camera.objects, camera.threshold, camera.sort)
+    place, scale = _scale(height, width, factor, camera.width, 3)
+    count = len(frames)
+    position = place(tracks.pose).reshape(count, -1)
+    flow = (flow_velocity(frames, tracks) * scale * fps).reshape(count, -1)
+    angles = list(range(2, position.shape[1], 3))
+    used = {"velocity" if camera.source == "flow" else "other": flow}
+    return Motion(position, angles, found=tracks.found, tracks=tracks, **used)
+
+
+def _scale(height: int, width: int, factor: float, metres: float | None, size: int):
+    """Return the map from pixels of reduced frames to positions, and the factors of differences."""
+    if metres is None:
+        scale = np.array([factor, factor, 1.0])[:size]
+        return lambda pose: (pose + _shift(0.5, size)) * scale - _shift(0.5, size), scale
+    scale = np.array([metres / width, -metres / width, -1.0])[:size]
+    origin = np.array([0.0, metres * height / width, 0.0])[:size]
+    return lambda pose: (pose + _shift(0.5, size)) * scale + origin, scale
+
+
+def _shift(pixels: float, size: int) -> np.ndarray:
+    return np.array([pixels, pixels, 0.0])[:size]

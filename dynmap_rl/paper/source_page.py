@@ -1,0 +1,53 @@
+"""Page of the grid of sources: tables, figures, rank correlations and commands."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dynmap_rl.utils.files import read_json, write_bytes
+
+from .source_results import (
+    data_table,
+    plot_data,
+    plot_measures,
+    plot_sources,
+    rank_correlations,
+    source_table,
+)
+from .tables import join_table
+
+
+def write_source_page(results: Path, tasks: list[str]) -> list[Path]:
+    """Write ``README.md`` and the figures into the folder of the results; return the files.
+
+    Args:
+        results: folder of the results.
+        tasks: names of the tasks, as in the names of the cells.
+    """
+    parts = [
+        "# Sources of dynamics, and numbers of demonstrations",
+        "SR in % with 95 % intervals over world models and policies on the shared start states. The share of the gain is "
+        "that of the simulator's dynamics over Only-RGB. Measures are means over world models. Written by "
+        "`recipes/paper/sources.py --write`.",
+    ]
+    written = []
+    for task in tasks:
+        parts += [f"## {task}", source_table(results, task)]
+        for name, plot in (("sources", plot_sources), ("measures", plot_measures)):
+            written.append(results / f"{task}_{name}.png")
+            plot(results, task, written[-1])
+            parts.append(f"![{name}]({written[-1].name})")
+        rows = [
+            [name, f"{row['rho']:.2f}", f"{row['p']:.2g}", str(row["sources"])]
+            for name, row in rank_correlations(results, task).items()
+        ]
+        if rows:
+            parts.append(join_table(["policy, measure", "rank correlation with SR", "p", "sources"], rows))
+    written.append(results / "data.png")
+    plot_data(results, "balance_reaching", written[-1])
+    parts += ["## Number of demonstrations", data_table(results, "balance_reaching"), "![data](data.png)"]
+    commands = sorted({read_json(path)["command"] for path in results.glob("*.json")})
+    parts += ["## Commands", "\n".join(["```bash", *commands, "```"])]
+    written.append(results / "README.md")
+    write_bytes(written[-1], ("\n\n".join(parts) + "\n").encode())
+    return written

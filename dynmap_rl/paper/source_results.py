@@ -1,0 +1,225 @@
+"""Results of the grid of sources: cheap measures of world models, table, page and figures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.stats import spearmanr
+from tensordict import TensorDictBase
+
+from dynmap_rl.evaluation.probing import probe
+from dynmap_rl.evaluation.protocol import result_rows
+from dynmap_rl.evaluation.statistics import shared_interval, summarize
+from dynmap_rl.modules.world_model import WorldModel
+from dynmap_rl.reporting.figures import plt, save_figure
+from dynmap_rl.utils.files import read_json
+
+from .sources import DATA_ROWS, POLICIES, SIZES, SOURCES, WORLD_MODELS, cell_name
+from .tables import join_table
+
+CONTEXT, HORIZON = 20, 40  # steps with frames, and then without
+MEASURES = {  # name: text, and the sign with which it should rise with success
+    "probe_position": ("R^2 of a linear map to the positions", 1),
+    "probe_velocity": ("R^2 of a linear map to the velocities", 1),
+    "open_loop_mm": ("error after 2 s without frames, by a linear map (mm)", -1),
+}
+
+
+@torch.no_grad()
+def measure_world_model(model: WorldModel, train: TensorDictBase, test: TensorDictBase) -> dict[str, float]:
+    """Measure a world model without a policy or a simulator, by linear maps to the true dynamics.
+
+    World models without supervision and with other entries are measured alike.
+
+    Args:
+        model: frozen world model.
+        train: demonstrations ``[E, T]`` with true dynamics, to fit the maps to.
+        test: held-out ones.
+
+    Returns:
+        ``probe_position`` and ``probe_velocity``, R^2 of the best state (latent or a hidden one), the mean over the
+        entries; ``open_loop_mm``, the mean distance of predicted and true positions of cart and block (mm) after two
+        seconds without frames.
+    """
+    found = probe(model, train, test)
+    result = {
+        f"probe_{quantity}": max(float(np.mean(states[quantity])) for states in found.values())
+        for quantity in ("position", "velocity")
+    }
+    x, y = _predictions(model, train), train["dynamics", "position"]
+    mean, center = x.flatten(0, 1).mean(0), y[:, 1:].flatten(0, 1).double().mean(0)
+    weights = torch.linalg.lstsq(
+        x.flatten(0, 1) - mean, y[:, 1:].flatten(0, 1).double() - center, driver="gelsd"
+    ).solution
+    last = CONTEXT + HORIZON - 1
+    predicted = (_predictions(model, test, CONTEXT)[:, last - 1] - mean) @ weights + center
+    error = (predicted - test["dynamics", "position"][:, last].double()).unflatten(-1, (-1, 3))[..., :2]
+    return result | {"open_loop_mm": 1000 * error.norm(dim=-1).mean().item()}
+
+
+def _predictions(model: WorldModel, episodes: TensorDictBase, context: int | None = None) -> torch.Tensor:
+    """Return predicted latents and hidden states ``[E, T - 1, F]`` from t = 1 on, without frames after ``context``."""
+    parts = []
+    for chunk in episodes.split(10):
+        chunk = chunk.to(next(model.parameters()).device)
+        latent = model.encode(chunk["pixels"], mixed=True).float()
+        states = (
+            model.predict(latent, chunk["action"])
+            if context is None
+            else model.transition.imagine(latent, chunk["action"], context)
+        )
+        parts.append(torch.cat(states, -1)[:, 1:].double().cpu())
+    return torch.cat(parts)
+
+
+def read_source(results: Path, task: str, source: str, policy: str, size: int = 300) -> dict | None:
+    """Read the results of all world models of a source.
+
+    Returns:
+        ``SR``, ``DR`` (%), ``PE`` (mm), the 95 % ``interval`` of SR over world models and policy seeds on the shared
+        start states, the SR of each of the ``world_models``, their number, and the mean of each of the ``measures``;
+        None without a result.
+    """
+    names = [cell_name(task, source, seed, policy, size) for seed in WORLD_MODELS]
+    names = names[:1] if source == "end_to_end" else names
+    found = [read_json(path) for name in names if (path := results / f"{name}.json").exists()]
+    if not found:
+        return None
+    by_model = [result_rows(result) for result in found]
+    rows = [of_seed for model in by_model for of_seed in model]
+    everything = summarize([row for of_seed in rows for row in of_seed])
+    measured = [
+        read_json(path)
+        for seed in WORLD_MODELS
+        if (
+            path := results / "measures" / f"{cell_name(task, source, seed, 'recurrent', size)}.json"
+        ).exists()
+    ]
+    return {
+        **{name: everything[name] for name in ("SR", "DR", "PE")},
+        "interval": shared_interval(rows),
+        "world_models": [summarize([r for seed in model for r in seed])["SR"] for model in by_model],
+        "measures": {name: float(np.mean([m[name] for m in measured])) for name in MEASURES if measured},
+        "commands": [result["command"] for result in found],
+    }
+
+
+def source_table(results: Path, task: str) -> str:
+    """Return the table of a task in Markdown: SR of both policies, share of the gain, and the cheap measures."""
+    found = {(s, p): read_source(results, task, s, p) for s in SOURCES for p in POLICIES}
+    lines = []
+    for name, source in SOURCES.items():
+        if not any(found[name, policy] for policy in POLICIES):
+            continue
+        line = [source.text]
+        for policy in POLICIES:
+            line += _rate(found[name, policy], found["none", policy], found["simulator", policy])
+        measures = (found[name, "recurrent"] or {}).get("measures") or {}
+        lines.append([*line, *(f"{measures[m]:.3g}" if m in measures else "" for m in MEASURES)])
+    head = ["dynamics"]
+    for policy in POLICIES:
+        head += [f"SR, {policy}", "of each world model", "share of the gain"]
+    return join_table([*head, *(text for text, _ in MEASURES.values())], lines)
+
+
+def _rate(cell: dict | None, none: dict | None, full: dict | None) -> list[str]:
+    if not cell:
+        return ["", "", ""]
+    low, high = cell["interval"]
+    gain = full["SR"] - none["SR"] if none and full else 0.0
+    share = f"{100 * (cell['SR'] - none['SR']) / gain:.0f} %" if gain > 0 else ""
+    each = ", ".join(f"{rate:.1f}" for rate in cell["world_models"])
+    return [f"**{cell['SR']:.1f}** [{low:.1f}, {high:.1f}]", each, share]
+
+
+def data_table(results: Path, task: str) -> str:
+    """Return SR against the number of demonstrations in Markdown, recurrent policies."""
+    lines = []
+    for name, text in DATA_ROWS.items():
+        cells = [read_source(results, task, name, "recurrent", size) for size in SIZES]
+        if any(cells):
+            lines.append([text, *(_rate(cell, None, None)[0] for cell in cells)])
+    return join_table(["", *map(str, SIZES)], lines)
+
+
+def rank_correlations(results: Path, task: str) -> dict[str, dict[str, float]]:
+    """Return Spearman's rank correlation of each measure with SR over the sources, by policy, with its p and number."""
+    correlations = {}
+    for policy in POLICIES:
+        for name in MEASURES:
+            x, y, _ = measured_points(results, task, policy, name)
+            if len(x) > 2:
+                found = spearmanr(x, y)
+                numbers = {"rho": float(found.statistic), "p": float(found.pvalue), "sources": len(x)}
+                correlations[f"{policy}, {name}"] = numbers
+    return correlations
+
+
+def measured_points(results: Path, task: str, policy: str, measure: str) -> tuple[list, list, list]:
+    """Return a measure, SR and name of every source that has both."""
+    points = []
+    for source in SOURCES:
+        cell, model = (read_source(results, task, source, p) for p in (policy, "recurrent"))
+        if cell and model and measure in model["measures"]:
+            points.append((model["measures"][measure], cell["SR"], source))
+    return tuple(map(list, zip(*points, strict=True))) if points else ([], [], [])
+
+
+def plot_sources(results: Path, task: str, path: Path) -> None:
+    """Draw SR with its interval against the source, for both policies."""
+    names = [s for s in SOURCES if any(read_source(results, task, s, p) for p in POLICIES)]
+    figure, axis = plt.subplots(figsize=(7, 0.3 * len(names) + 1), layout="constrained")
+    for shift, policy in zip((-0.12, 0.12), POLICIES, strict=True):
+        for row, name in enumerate(names):
+            if cell := read_source(results, task, name, policy):
+                color = "tab:blue" if policy == "recurrent" else "tab:orange"
+                axis.plot(cell["interval"], [row + shift] * 2, color=color, lw=1.5)
+                label = policy if name == names[0] else None
+                axis.plot(cell["SR"], row + shift, "o", color=color, ms=4, label=label)
+    axis.set_yticks(range(len(names)), [SOURCES[name].text for name in names], fontsize=8)
+    axis.invert_yaxis()
+    axis.set_xlabel("success [%]", fontsize=8)
+    axis.grid(alpha=0.3)
+    axis.legend(fontsize=7)
+    save_figure(figure, path)
+
+
+def plot_data(results: Path, task: str, path: Path) -> None:
+    """Draw SR with its interval against the number of demonstrations."""
+    figure, axis = plt.subplots(figsize=(5.5, 3.5), layout="constrained")
+    for name, text in DATA_ROWS.items():
+        cells = {size: read_source(results, task, name, "recurrent", size) for size in SIZES}
+        cells = {size: cell for size, cell in cells.items() if cell}
+        if cells:
+            [line] = axis.plot(list(cells), [cell["SR"] for cell in cells.values()], marker=".", label=text)
+            low, high = zip(*(cell["interval"] for cell in cells.values()), strict=True)
+            axis.fill_between(list(cells), low, high, color=line.get_color(), alpha=0.15, lw=0)
+    axis.set_xscale("log")
+    axis.set_xticks(SIZES, map(str, SIZES))
+    axis.minorticks_off()
+    axis.set(xlabel="demonstrations", ylabel="success [%]", ylim=(-3, 103))
+    axis.grid(alpha=0.3)
+    if axis.lines:
+        axis.legend(fontsize=8)
+    save_figure(figure, path)
+
+
+def plot_measures(results: Path, task: str, path: Path) -> None:
+    """Draw SR against each cheap measure, with the rank correlation."""
+    correlations = rank_correlations(results, task)
+    figure, axes = plt.subplots(1, len(MEASURES), figsize=(11, 3.5), sharey=True, layout="constrained")
+    for axis, (measure, (text, _)) in zip(axes, MEASURES.items(), strict=True):
+        for policy, marker in zip(POLICIES, "os", strict=True):
+            x, y, names = measured_points(results, task, policy, measure)
+            rho = correlations.get(f"{policy}, {measure}", {}).get("rho")
+            label = policy if rho is None else f"{policy}, rank correlation {rho:.2f}"
+            axis.plot(x, y, marker, ms=4, label=label)
+            for place in zip(x, y, names, strict=True) if policy == "recurrent" else ():
+                axis.annotate(place[2], place[:2], fontsize=5)
+        axis.set_xlabel(text, fontsize=8)
+        axis.grid(alpha=0.3)
+        axis.legend(fontsize=7)
+    axes[0].set_ylabel("success [%]", fontsize=8)
+    save_figure(figure, path)

@@ -1,0 +1,181 @@
+"""Where the dynamics come from, and how many demonstrations: the cells of the grid, and the datasets they train on."""
+
+from __future__ import annotations
+
+from collections.abc import Container
+from dataclasses import dataclass
+from pathlib import Path
+
+from dynmap_rl.data.derive import add_dynamics
+from dynmap_rl.data.recording.record import record_dataset
+from dynmap_rl.envs.tasks import get_task
+from dynmap_rl.training.dataset import find_or_record
+from dynmap_rl.utils.files import write_json
+
+from .cells import TASKS, Run
+
+POLICIES = "recurrent", "feedforward"
+WORLD_MODELS = 0, 1, 2  # seeds
+SIZES = 30, 100, 300, 1000  # demonstrations
+SUPERVISION = "position,velocity"
+TURN = 5  # rad of noise on an angle for a metre of noise on a position
+
+
+@dataclass(frozen=True)
+class Source:
+    """A source of dynamics.
+
+    Attributes:
+        text: name in tables and figures.
+        columns: arguments of :func:`dynmap_rl.data.add_dynamics`; None leaves the recorded columns.
+        options: options of ``recipes/decoupled.py``.
+        supervision: dynamics that the world model is trained on.
+    """
+
+    text: str
+    columns: dict | None = None
+    options: tuple[str, ...] = ()
+    supervision: str = SUPERVISION
+
+
+def _derived(method: str, noise: int) -> Source:
+    columns = {"state": "dynamics.position", "angles": [2, 5], "method": method}
+    if noise:
+        columns |= {"noise": noise / 1000, "angle_noise": TURN * noise / 1000}
+    return Source(f"{method}, noise of {noise} mm", columns)
+
+
+SOURCES = {
+    "simulator": Source("simulator"),
+    "none": Source("none (Only-RGB)", supervision="none"),
+    **{f"{method}_{mm}": _derived(method, mm) for method in ("central", "savgol") for mm in (0, 2, 5, 10)},
+    "centroid": Source("frames: centroid", {"source": "centroid"}),
+    "tracks": Source("frames: tracks", {"source": "tracks"}),
+    "flow": Source("frames: tracks and flow", {"source": "flow"}),
+    **{
+        f"labelled_{share}": Source(
+            f"{share} % of the episodes", None, ("--world_model.labelled", str(share / 100))
+        )
+        for share in (5, 10, 25, 50)
+    },
+    "command": Source("commanded cart pose", {"columns": [0, 1, 2], "angles": [2]}),
+    "informed": Source("simulator, no RGB loss", None, ("--world_model.beta_rgb", "0")),
+}
+DATA_ROWS = {
+    "none": "Only-RGB",
+    "tracks": "RGB+[P+V], tracked",
+    "simulator": "RGB+[P+V]",
+    "end_to_end": "End-to-End",
+}
+
+
+def list_source_cells(
+    tasks: tuple[str, ...] = TASKS[:1],
+    datasets: Path = Path("datasets/sources"),
+    only: Container[str] = tuple(SOURCES),
+) -> list[Run]:
+    """Return the cells of the table, those that train world models first.
+
+    Args:
+        tasks: tasks of the cells. A task that is not in the plane has only the sources without columns of their own.
+        datasets: folder of the derived datasets.
+        only: sources to list.
+    """
+    cells = []
+    for task in tasks:
+        planar = get_task(task).planar
+        names = [name for name, s in SOURCES.items() if name in only and (planar or s.columns is None)]
+        cells += [_cell(task, name, seed, datasets) for seed in WORLD_MODELS for name in names]
+    return cells + [_reuse(cell) for cell in cells]
+
+
+def list_data_cells(
+    datasets: Path = Path("datasets/sources"), only: Container[str] = tuple(DATA_ROWS)
+) -> list[Run]:
+    """Return the cells of the amount of data on task 1; those of 300 demonstrations are cells of the table too.
+
+    Args:
+        datasets: folder of the datasets.
+        only: rows to list.
+    """
+    cells = []
+    for size in SIZES:
+        names = [name for name in DATA_ROWS if name in only and name in SOURCES]
+        cells += [_cell(TASKS[0], name, seed, datasets, size) for seed in WORLD_MODELS for name in names]
+        if "end_to_end" in only:
+            dataset = str(dataset_folder(TASKS[0], "simulator", datasets, size))
+            arguments = ("--task", TASKS[0], "--dataset", dataset, "--eval.paper_episodes", "0")
+            name = cell_name(TASKS[0], "end_to_end", 0, "recurrent", size)
+            cell = TASKS[0], "joint", "recurrent", DATA_ROWS["end_to_end"]
+            cells.append(Run(name, "end_to_end", cell, arguments, table="sources"))
+    return cells
+
+
+def cell_name(task: str, source: str, seed: int, policy: str, size: int = 300) -> str:
+    """Return the name of a cell."""
+    amount = "" if size == 300 else f"_{size}_demonstrations"
+    model = "" if source == "end_to_end" else f"_world_model_{seed}"
+    return f"{get_task(task).name}_{source}{amount}{model}_{policy}"
+
+
+def dataset_folder(task: str, source: str, datasets: Path, size: int = 300) -> Path:
+    """Return the folder of the dataset of a source; sources without columns of their own share the recording."""
+    name = get_task(task).name
+    if SOURCES[source].columns is None:
+        return Path("datasets") / name if size == 300 else datasets / f"{name}_{size}"
+    return datasets / (f"{name}_{source}" if size == 300 else f"{name}_{size}_{source}")
+
+
+def make_datasets(cells: list[Run], datasets: Path, workers: int = 1) -> None:
+    """Record and derive the datasets of cells that are missing.
+
+    Args:
+        cells: cells of :func:`list_source_cells` and :func:`list_data_cells`.
+        datasets: folder of the derived datasets; ``NAME.quality.json`` beside each has its quality.
+        workers: processes that record.
+    """
+    wanted = {cell.arguments[cell.arguments.index("--dataset") + 1]: cell.task for cell in cells}
+    for task in sorted(set(wanted.values())):
+        for size in SIZES:
+            recording = dataset_folder(task, "simulator", datasets, size)
+            for name, source in SOURCES.items():
+                folder = dataset_folder(task, name, datasets, size)
+                if str(folder) not in wanted:
+                    continue
+                if size == 300:
+                    find_or_record(task)
+                else:
+                    record_dataset(recording, task, episodes=size, workers=workers)
+                if source.columns is not None and not folder.exists():
+                    print(f"deriving {folder}", flush=True)
+                    found = add_dynamics(recording, folder, **source.columns, replace=True)
+                    differences = {q: d.tolist() for q, d in found["differences"].items()}
+                    quality = found["quality"] | {"differences": differences}
+                    write_json(folder.with_name(f"{folder.name}.quality.json"), quality)
+
+
+def _cell(task: str, name: str, seed: int, datasets: Path, size: int = 300) -> Run:
+    """Return the cell that trains a world model and recurrent policies."""
+    source = SOURCES[name]
+    arguments = (
+        "--task", task, "--dataset", str(dataset_folder(task, name, datasets, size)),
+        "--world_model.supervision", source.supervision, "--eval.paper_episodes", "0",
+        "--world_model.seed", str(seed), *source.options,
+    )  # fmt: skip
+    cell = task, "decoupled", "recurrent", source.text
+    return Run(cell_name(task, name, seed, "recurrent", size), "decoupled", cell, arguments, table="sources")
+
+
+def _reuse(cell: Run) -> Run:
+    """Return the cell that trains feed-forward policies on the world model of a recurrent cell."""
+    name = f"{cell.name.removesuffix('recurrent')}feedforward"
+    shared = cell.arguments[: cell.arguments.index("--world_model.seed")]
+    task, training, _, row = cell.cell
+    return Run(
+        name,
+        cell.recipe,
+        (task, training, "feedforward", row),
+        (*shared, "--policy.kind", "feedforward"),
+        needs=cell.name,
+        table=cell.table,
+    )

@@ -1,0 +1,144 @@
+"""Compare sources of dynamics, and numbers of demonstrations, in closed loop.
+
+    python recipes/paper/sources.py --dry_run
+    python recipes/paper/sources.py --only tracks,none,simulator
+    python recipes/paper/sources.py --part data
+    python recipes/paper/sources.py --write       # table and figures from the results alone
+
+The table has a world model for each source of dynamics and seed, with recurrent and feed-forward policies (see
+dynmap_rl/paper/sources.py). Its datasets are derived from the recordings of the tasks where they are missing. A cell is a
+run of recipes/decoupled.py or end_to_end.py; a result is a JSON file, cells with a result are skipped, and the same
+command resumes a stopped grid. Every world model is then measured by linear maps. The folder of the results gets
+README.md with the tables and the rank correlation of the measures with success, and the figures.
+"""
+
+import sys
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from dynmap_rl.utils.cli import command_line, run_recipe
+from dynmap_rl.utils.settings import check_at_least, check_choice
+
+RECIPES = Path(__file__).parents[1]
+RESULTS = RECIPES / "results"
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of the recipe."""
+
+    # Cells: table (sources), data (numbers of demonstrations, task 1), or all.
+    part: str = "all"
+    # Tasks of the table, with commas between.
+    tasks: str = "balance_reaching"
+    # Sources with commas between; by default all. --dry_run lists them in the names of the cells.
+    only: str = ""
+    # Folder of the cells' results.
+    results: Path = RESULTS / "sources"
+    # Folder of the cells' runs.
+    runs: Path = Path("runs/sources")
+    # Folder of the derived datasets.
+    datasets: Path = Path("datasets/sources")
+    # Cells at a time; each takes two cores if it is alone, otherwise one.
+    workers: int = 1
+    # Demonstrations that the linear maps are fitted to.
+    probe_episodes: int = 100
+    # Folder with a settings file RECIPE.yaml for any of the recipes, passed to their cells as --config_path.
+    presets: Path | None = None
+    # List the cells with their minutes, and stop.
+    dry_run: bool = False
+    # Write tables and figures from the results alone, and stop.
+    write: bool = False
+
+    def __post_init__(self):
+        check_choice(self, "part", ("table", "data", "all"))
+        check_at_least(self, 1, "workers", "probe_episodes")
+        if self.presets and not self.presets.is_dir():
+            raise ValueError(f"--presets must be a folder, got {self.presets}")
+
+
+def main(config: Config) -> None:
+    """Run the cells without a result, measure, and write."""
+    from dynmap_rl.paper.launch import execute, has_run, is_done, launch
+    from dynmap_rl.paper.sources import make_datasets
+
+    if config.write:
+        return write(config)
+    cells = choose_cells(config)
+    todo = [cell for cell in cells if not is_done(cell.name, config.results)]
+    needed = {cell.needs for cell in todo if cell.needs and not has_run(cell.needs, config.runs)}
+    todo = [cell for cell in cells if cell in todo or cell.name in needed]
+    if config.dry_run:
+        for cell in cells:
+            print(f"{f'{cell.minutes:3} min' if cell in todo else '   done'}  {cell.name}")
+        hours = sum(cell.minutes for cell in todo) / 60
+        print(
+            f"{len(cells) - len(todo)} of {len(cells)} cells are complete; about {hours:.1f} hours of one core are left"
+        )
+        return None
+    make_datasets(todo, config.datasets, workers=2 if config.workers == 1 else config.workers)
+    run = partial(
+        execute, recipes=RECIPES, results=config.results, runs=config.runs,
+        threads=2 if config.workers == 1 else 1, presets=config.presets, root=Path.cwd(),
+    )  # fmt: skip
+    failed = launch(todo, run, workers=config.workers)
+    measure(config, cells)
+    write(config)
+    if failed:
+        raise ValueError("; ".join(failed))
+    return None
+
+
+def choose_cells(config: Config) -> list:
+    """Return the cells of the settings; those that train world models come first."""
+    from dynmap_rl.paper.sources import DATA_ROWS, SOURCES, list_data_cells, list_source_cells
+
+    only = set(config.only.split(",")) if config.only else {*SOURCES, *DATA_ROWS}
+    if unknown := only - {*SOURCES, *DATA_ROWS}:
+        names = ",".join(dict.fromkeys([*SOURCES, *DATA_ROWS]))
+        raise ValueError(f"--only must be any of {names}, got {','.join(sorted(unknown))}")
+    tasks = tuple(config.tasks.split(","))
+    cells = list_source_cells(tasks, config.datasets, only) if config.part != "data" else []
+    cells += list_data_cells(config.datasets, only) if config.part != "table" else []
+    unique = {cell.name: cell for cell in cells}
+    return sorted(unique.values(), key=lambda cell: cell.needs is not None)
+
+
+def measure(config: Config, cells: list) -> None:
+    """Measure the world models of the recurrent cells whose runs are here, on the recorded dynamics."""
+    from dynmap_rl.data.demonstrations import load_demonstrations
+    from dynmap_rl.envs.tasks import get_task
+    from dynmap_rl.paper.launch import has_run
+    from dynmap_rl.paper.source_results import measure_world_model
+    from dynmap_rl.runs.lookup import load_source
+    from dynmap_rl.training.dataset import find_or_record
+    from dynmap_rl.utils.files import write_json
+    from dynmap_rl.utils.version import find_commit
+
+    for task in sorted({cell.task for cell in cells if get_task(cell.task).planar}):
+        own = [c for c in cells if c.task == task and c.recipe == "decoupled" and not c.needs]
+        paths = {c.name: config.results / "measures" / f"{c.name}.json" for c in own}
+        todo = [name for name, path in paths.items() if has_run(name, config.runs) and not path.exists()]
+        if not todo:
+            continue
+        episodes, _ = load_demonstrations(find_or_record(task))
+        for name in todo:
+            model, _ = load_source(config.runs / name)
+            found = measure_world_model(model, episodes["train"][: config.probe_episodes], episodes["eval"])
+            write_json(paths[name], found | {"command": command_line(sys.argv), "commit": find_commit()})
+
+
+def write(config: Config) -> None:
+    """Write README.md and the figures into the folder of the results."""
+    from dynmap_rl.envs.tasks import get_task
+    from dynmap_rl.paper.source_page import write_source_page
+
+    tasks = [get_task(task).name for task in config.tasks.split(",")]
+    if not any(config.results.glob("*.json")):
+        raise ValueError(f"{config.results} must have results; run recipes/paper/sources.py first")
+    print("\n".join(f"written: {path}" for path in write_source_page(config.results, tasks)))
+
+
+if __name__ == "__main__":
+    run_recipe(main, Config, sys.argv)

@@ -1,0 +1,126 @@
+"""Quality of derived columns: films and positions that are good, and bad in one known way."""
+
+import numpy as np
+import pytest
+from films import film, make_poses
+from robot_dataset import make_robot_dataset
+
+from dynmap_rl.data.derive import differentiate
+from dynmap_rl.data.format.reading import read_info
+from dynmap_rl.data.quality import LIMITS, Derived, judge_quality, quality_text, worst_episode
+from dynmap_rl.data.sources import Camera, Motion, measure, read_motion
+
+NAMES = ["low_x", "low_y", "low_theta", "high_x", "high_y", "high_theta"]
+POSES = make_poses(120)
+
+
+def judge(frames, objects=2):
+    motion = measure(frames, 1.0, Camera("tracks", "front", objects), 20)
+    velocity, _ = differentiate(motion.position, np.arange(len(frames)) / 20, "savgol")
+    return judge_quality([Derived(7, motion.position, velocity, motion)], NAMES[: 3 * objects])
+
+
+def hide(frames):
+    for t in range(0, 120, 8):
+        frames[t] = film(POSES[t : t + 1], bodies=[0])[0]
+    return frames
+
+
+def shake(t):
+    row = np.arange(96)[:, None, None]
+    stripes = np.where((row + 3 * (t % 5)) // 6 % 2, 200, 90)
+    return np.broadcast_to(np.where(row < 62, stripes, 220), (96, 96, 3))
+
+
+def leave():
+    poses = POSES.copy()
+    poses[..., 0] += 0.25
+    return poses
+
+
+FILMS = {  # check that must fail: film
+    None: lambda: film(POSES),
+    "lost": lambda: hide(film(POSES)),
+    "cut": lambda: film(leave()),
+    "size": lambda: film(POSES, scale=0.2),
+    "background": lambda: film(POSES, bodies=[0, 1], background=shake),
+    "step": lambda: film(POSES[::10], noise=2.0),
+}
+
+
+@pytest.mark.parametrize("fault", FILMS, ids=str)
+def test_a_fault_of_a_film_is_found_with_its_place(fault):
+    quality = judge(FILMS[fault]())
+    bad = {name for name, check in quality["checks"].items() if not check["good"]}
+    assert set(quality["checks"]) == set(LIMITS)
+    if fault is None:
+        assert bad == set() and quality["verdict"] == "good"
+        return
+    assert fault in bad and quality["verdict"] == "doubtful"
+    assert quality["checks"][fault]["episode"] == worst_episode(quality) == 7
+    assert LIMITS[fault][3] in quality_text(quality)
+    if fault == "lost":
+        assert quality["checks"]["lost"]["where"] == "high"
+
+
+def judge_state(position):
+    velocity, _ = differentiate(position, np.arange(len(position)) / 20)
+    return judge_quality([Derived(0, position, velocity, Motion(position, [2, 5]))], NAMES)["checks"]
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("jumps", lambda p: p + 0.3 * np.isin(np.arange(120), [30, 31, 70])[:, None] * [0, 1, 0, 0, 0, 0]),
+        (
+            "residual",
+            lambda p: p + 0.02 * np.random.default_rng(0).standard_normal(p.shape) * [1, 1, 0, 1, 1, 0],
+        ),
+        (
+            "residual_angle",
+            lambda p: p + 0.2 * np.random.default_rng(0).standard_normal(p.shape) * [0, 0, 1, 0, 0, 1],
+        ),
+    ],
+)
+def test_a_fault_of_positions_is_found(name, change):
+    position = POSES.reshape(120, 6)
+    good, bad = judge_state(position), judge_state(change(position))
+    assert set(good) == {"jumps", "residual", "residual_angle"}, "a state has no frames"
+    assert all(check["good"] for check in good.values()) and not bad[name]["good"]
+
+
+def test_angles_in_degrees_are_judged_like_those_in_radians():
+    noisy = POSES.reshape(120, 6) + 0.2 * np.random.default_rng(0).standard_normal((120, 6)) * [
+        0,
+        0,
+        1,
+        0,
+        0,
+        1,
+    ]
+    degrees = noisy * np.tile([1, 1, 180 / np.pi], 2)
+    motions = Motion(noisy, [2, 5]), Motion(degrees, [2, 5], 360)
+    found = [judge_quality([Derived(0, m.position, m.position, m)], NAMES)["checks"] for m in motions]
+    assert found[0]["residual_angle"]["value"] == pytest.approx(found[1]["residual_angle"]["value"])
+
+
+def test_noise_of_positions_is_measured():
+    """The smooth trajectory follows a part of the noise: three of the seven steps of its window are free."""
+    position, extent = POSES.reshape(120, 6), np.ptp(np.quantile(POSES[:, 0, 0], [0.05, 0.95]))
+    noisy = position + 0.005 * np.random.default_rng(1).standard_normal(position.shape)
+    assert judge_state(noisy)["residual"]["value"] * extent == pytest.approx(0.005 * (4 / 7) ** 0.5, rel=0.25)
+
+
+def test_the_worst_episode_is_named_and_a_dataset_is_judged(tmp_path):
+    root = make_robot_dataset(tmp_path / "robot")
+    camera = Camera("tracks", "observation.images.top", 1)
+    episodes = []
+    for episode, motion in read_motion(root, read_info(root), camera):
+        position = motion.position.copy()
+        if episode == 2:
+            position[::5] += 9
+        episodes.append(
+            Derived(episode, position, differentiate(position, np.arange(len(position)))[0], motion)
+        )
+    checks = judge_quality(episodes, camera.names)["checks"]
+    assert checks["residual"]["episode"] == 2 and checks["lost"]["value"] == 0

@@ -1,0 +1,60 @@
+"""Cheap measures of world models, and their rank correlation with success."""
+
+import pytest
+import torch
+from small import CONSTANTS, make_episodes, make_model
+
+from dynmap_rl.modules.checkpoints import make_world_model
+from dynmap_rl.paper import source_results
+from dynmap_rl.paper.source_results import measure_world_model, rank_correlations
+from dynmap_rl.utils.files import write_json
+
+
+@pytest.fixture
+def short(monkeypatch):
+    monkeypatch.setattr(source_results, "CONTEXT", 4)
+    monkeypatch.setattr(source_results, "HORIZON", 6)
+
+
+def test_a_world_model_without_supervision_is_measured_like_any_other(short):
+    episodes = make_episodes(2)["train"]
+    torch.manual_seed(0)
+    plain = make_world_model(CONSTANTS, (), latent_size=16, hidden_size=24)
+    for model in (plain, make_model()):
+        found = measure_world_model(model, episodes, episodes)
+        assert set(found) == set(source_results.MEASURES)
+        assert found["probe_position"] == pytest.approx(1, abs=1e-3), (
+            "36 steps, fitted by more numbers than that"
+        )
+
+
+def test_the_open_loop_error_is_that_of_the_step_after_the_horizon(short):
+    """A dynamics that jumps there alone is not predicted from what comes before."""
+    episodes = make_episodes(8)["train"].clone()
+    episodes["dynamics", "position"][:] = 0.5
+    still = measure_world_model(make_model(), episodes, episodes)["open_loop_mm"]
+    other = episodes.clone()
+    other["dynamics", "position"][:, 9, [0, 3]] += 0.1
+    moved = measure_world_model(make_model(), episodes, other)["open_loop_mm"]
+    assert still == pytest.approx(0, abs=1e-3) and moved == pytest.approx(100, abs=0.1)
+
+
+def test_rank_correlations_are_over_the_sources(tmp_path):
+    flags = {"dropped": "0000", "touched": "0000", "first_scene_seed": 0, "position_error": [0.01] * 4}
+    for count, source in enumerate(("none", "tracks", "flow", "simulator")):
+        name = f"balance_reaching_{source}_world_model_0_recurrent.json"
+        rows = flags | {"success": "1" * count + "0" * (4 - count)}
+        write_json(tmp_path / name, {"results": [{"test": {"rows": rows}}], "command": "python x.py"})
+        measures = {
+            "probe_position": count**2,
+            "probe_velocity": 1.0 - count,
+            "open_loop_mm": 10.0 / (1 + count),
+        }
+        write_json(tmp_path / "measures" / name, measures)
+    found = rank_correlations(tmp_path, "balance_reaching")
+    rho = {name: row["rho"] for name, row in found.items()}
+    assert rho == {
+        "recurrent, probe_position": pytest.approx(1),
+        "recurrent, probe_velocity": pytest.approx(-1),
+        "recurrent, open_loop_mm": pytest.approx(-1),
+    }

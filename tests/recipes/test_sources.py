@@ -1,0 +1,118 @@
+"""The grid of sources: choice of the cells, resuming, page and figures; and real cells in a small size."""
+
+import json
+
+import commands
+import pytest
+
+from dynmap_rl.paper.sources import SIZES, SOURCES
+from dynmap_rl.utils.files import read_json, write_json
+
+TASK = "balance_reaching"
+SMALL = "--results", "results", "--presets", str(commands.PRESETS)
+
+
+def run(folder, *arguments):
+    return commands.run(folder, "sources", *SMALL, *arguments)
+
+
+def listed(folder, *arguments):
+    lines = run(folder, "--dry_run", *arguments).stdout.splitlines()
+    return [line.split()[-1] for line in lines[:-1]], lines[-1]
+
+
+def fake_script(calls):
+    """Return a stand-in for ``run_script`` that keeps the arguments and writes a result."""
+
+    def run_script(script, arguments, folder, log):
+        given = dict(zip(arguments[::2], arguments[1::2], strict=True))
+        calls.append((script.stem, given))
+        rows = {"success": "110", "dropped": "000", "touched": "000", "first_scene_seed": 0}
+        result = {
+            "results": [{"test": {"rows": rows | {"position_error": [0.01] * 3}}}],
+            "command": "python x.py",
+        }
+        write_json(folder / given["--run"] / "eval.json", result)
+        return 0
+
+    return run_script
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    """Calls of the cells' recipes, which are not run."""
+    calls = []
+    monkeypatch.setattr("dynmap_rl.paper.launch.run_script", fake_script(calls))
+    monkeypatch.setattr("dynmap_rl.paper.sources.make_datasets", lambda *arguments, **options: None)
+    monkeypatch.setattr("recipes.paper.sources.measure", lambda config, cells: None)
+    return calls
+
+
+def test_every_source_has_three_world_models_and_two_policies(tmp_path):
+    names, said = listed(tmp_path, "--part", "table")
+    assert len(names) == len(set(names)) == 6 * len(SOURCES) and "hours of one core" in said
+    assert sum(name.endswith("feedforward") for name in names) == 3 * len(SOURCES)
+    data, _ = listed(tmp_path, "--part", "data")
+    assert len(data) == len(SIZES) * (3 * 3 + 1)
+    both, _ = listed(tmp_path)
+    assert set(both) == {*names, *data} and len(set(names) & set(data)) == 9, "those of 300 demonstrations"
+    assert {name for name in names if "_tracks_" in name} == set(
+        listed(tmp_path, "--part", "table", "--only", "tracks")[0]
+    )
+
+
+def test_cells_run_once_and_make_a_page(calls, tmp_path):
+    result = run(tmp_path, "--only", "tracks,none,simulator,end_to_end")
+    assert result.returncode == 0, result.stderr
+    recipes = [recipe for recipe, _ in calls]
+    assert recipes.count("end_to_end") == 4 and recipes.count("decoupled") == 9 * 4 + 9
+    by_run = {given["--run"].rpartition("/")[2]: given for _, given in calls}
+    tracked = by_run[f"{TASK}_tracks_1000_demonstrations_world_model_2_recurrent"]
+    assert tracked["--dataset"].endswith(f"{TASK}_1000_tracks") and tracked["--world_model.seed"] == "2"
+    reused = by_run[f"{TASK}_tracks_world_model_1_feedforward"]
+    assert reused["--pretrained"].endswith(f"{TASK}_tracks_world_model_1_recurrent")
+    assert "--world_model.seed" not in reused and reused["--world_model.supervision"] == "position,velocity"
+    page = (tmp_path / "results/README.md").read_text()
+    assert "frames: tracks" in page and "| RGB+[P+V], tracked | **66.7**" in page
+    for name in (f"{TASK}_sources", f"{TASK}_measures", "data"):
+        assert (tmp_path / f"results/{name}.png").exists() and f"({name}.png)" in page
+    calls.clear()
+    assert run(tmp_path, "--only", "tracks,none,simulator,end_to_end").returncode == 0 and calls == []
+    (tmp_path / f"results/{TASK}_tracks_world_model_1_feedforward.json").unlink()
+    run(tmp_path, "--only", "tracks")
+    assert len(calls) == 1
+
+
+@pytest.mark.slow
+def test_real_cells(recordings, tmp_path, monkeypatch):
+    """A source of columns of its own, with fewer entries than the task has, trains, is evaluated and measured."""
+    commands.place_recordings(tmp_path, recordings, TASK)
+    monkeypatch.setattr("dynmap_rl.paper.sources.WORLD_MODELS", (0,))
+    result = run(
+        tmp_path, "--part", "table", "--only", "command,tracks,labelled_50,informed", "--workers", "2"
+    )
+    assert result.returncode == 0, result.stderr
+    results = {p.stem: read_json(p) for p in (tmp_path / "results").glob("*.json")}
+    assert len(results) == 8 and all(r["test_protocol"]["episodes"] == 3 for r in results.values())
+    measured = [json.loads(p.read_text()) for p in (tmp_path / "results/measures").glob("*.json")]
+    assert len(measured) == 4 and all(0 < m["open_loop_mm"] < 2000 for m in measured)
+    assert read_json(tmp_path / f"datasets/sources/{TASK}_tracks.quality.json")["verdict"] in (
+        "good",
+        "doubtful",
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--only", "radar"], "'radar'|radar"),
+        (["--part", "half"], "'half'"),
+        (["--write"], "results must have results"),
+        (["--tasks", "nothing", "--dry_run"], "nothing"),
+        (["--workers", "0"], "workers"),
+    ],
+)
+def test_bad_input_gets_one_clear_line(tmp_path, arguments, message):
+    result = run(tmp_path, *arguments)
+    assert result.returncode == 2
+    assert message.split("|")[-1] in result.stderr and "Traceback" not in result.stderr
