@@ -111,7 +111,8 @@ def judge_policy(config: Config) -> tuple[Path, str, dict]:
         if not isinstance(actor, Actor):
             raise ValueError("--policy must be a run for --delay; add --stale for a LeRobot policy")
         actor = DelayedActor(actor, max_delay=delay.longest)
-    result = evaluate(actor, task, config.eval, delay, workers=config.compute.threads)["test"]
+    workers = config.compute.threads if isinstance(actor, Actor | DelayedActor) else 1
+    result = evaluate(actor, task, config.eval, delay, workers=workers)["test"]
     summary = result["summary"]
     low, high = summary["SR_interval"]
     text = f"DR {summary['DR']:.1f} %   PE {summary['PE']:.1f} mm   SR {summary['SR']:.1f} % [{low:.1f}, {high:.1f}]"

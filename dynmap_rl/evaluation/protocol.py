@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import pickle
+from collections.abc import Callable
 from functools import partial
+from itertools import chain
 
 import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from dynmap_rl.envs.delay import FrameDelay
+from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.modules.actor import Actor
 from dynmap_rl.modules.world_model import WorldModel
 from dynmap_rl.utils.processes import map_processes
@@ -19,7 +22,7 @@ from .settings import SHARED_STARTS, Evaluation
 from .statistics import summarize
 
 FLAGS = "success", "dropped", "touched"
-BATCH = 64  # episodes of a batch on a CPU, whose activations fit into the processor's cache
+BATCH = 128  # episodes of a batch on a CPU; about half of their frames change in a step
 
 
 def evaluate(
@@ -30,7 +33,7 @@ def evaluate(
     pushed: bool = False,
     workers: int = 1,
 ) -> dict[str, dict[str, dict]]:
-    """Evaluate an actor in closed loop: on a CPU in batches of 64 episodes, on a GPU in one batch.
+    """Evaluate an actor in closed loop: on a CPU in batches of 128 episodes, on a GPU in one batch.
 
     Args:
         actor: see :func:`dynmap_rl.evaluation.roll_out`.
@@ -38,14 +41,15 @@ def evaluate(
         settings: scenes to evaluate on; default :class:`Evaluation`.
         delay: delay of the frames; see :func:`dynmap_rl.evaluation.roll_out`, also for the next.
         pushed: push the cart.
-        workers: processes that share the batches of a CPU, each with one thread. The result does not depend on their
-            number. A script that uses more than one must have the guard ``if __name__ == "__main__"``.
+        workers: processes that share the batches of a CPU, each with one thread of torch. With one thread, the result
+            does not depend on their number. A script that uses more than one must have the guard ``if __name__ == "__main__"``.
 
     Returns:
         ``test`` on the shared start states and, if ``settings.paper_episodes`` is not 0, ``paper`` on others. Each has
         ``summary`` (see :func:`dynmap_rl.evaluation.summarize`) and ``rows`` (see :func:`pack_rows`).
 
     Raises:
+        ValueError: the actor cannot be sent to other processes.
         OSError: a process died.
     """
     settings = settings or Evaluation()
@@ -64,20 +68,39 @@ def evaluate(
 
 def _judge_batches(actor: TensorDictModuleBase, run: partial, seeds: list[int], workers: int) -> list[dict]:
     """Return the rows of all scenes, a batch after the other or in several processes."""
-    batches = [seeds[start : start + BATCH] for start in range(0, len(seeds), BATCH)]
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # a sum's last bit may depend on the threads
+    # A task that limits its worlds divides the batches, and needs long to make new worlds.
+    size = BATCH if get_task(run.keywords["task"]).max_worlds is None else 2 * BATCH
+    batches = [seeds[start : start + size] for start in range(0, len(seeds), size)]
+    judge, title = partial(_judge_batch, lambda: actor, run), f"{len(seeds)} episodes"
+    if min(workers, len(batches)) <= 1:
+        return list(chain.from_iterable(map_processes(judge, batches, 1, title)))
+    judge, threads = partial(_judge_batch, partial(_load_actor, _pickle(actor)), run), torch.get_num_threads()
+    torch.set_num_threads(1)
     try:
-        judge = partial(_judge_batch, pickle.dumps(actor), run)
-        parts = map_processes(judge, batches, workers, f"{len(seeds)} episodes")
+        return list(chain.from_iterable(map_processes(judge, batches, workers, title)))
     finally:
         torch.set_num_threads(threads)
-    return [row for part in parts for row in part]
 
 
-def _judge_batch(actor: bytes, run: partial, seeds: list[int]) -> list[dict]:
+def _pickle(actor: TensorDictModuleBase) -> bytes:
+    """Return the actor as bytes; as an argument of a process, each of its tensors would hold a file open.
+
+    Raises:
+        ValueError: the actor cannot be sent to another process.
+    """
+    try:
+        return pickle.dumps(actor)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise ValueError(f"this actor cannot be evaluated by several processes ({error}); use one") from error
+
+
+def _load_actor(actor: bytes) -> TensorDictModuleBase:
     torch.set_num_threads(1)
-    return episode_rows(run(pickle.loads(actor), seeds=seeds, progress=False), seeds)
+    return pickle.loads(actor)
+
+
+def _judge_batch(load: Callable[[], TensorDictModuleBase], run: partial, seeds: list[int]) -> list[dict]:
+    return episode_rows(run(load(), seeds=seeds, progress=False), seeds)
 
 
 def judge_in_closed_loop(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 
 import torch
 from tensordict import TensorDict
@@ -18,6 +19,8 @@ from dynmap_rl.envs.scene import scene_seed
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.modules.delayed_actor import DelayedActor
+
+from .still import reuse_still_frames
 
 EVENTS = tuple(("next", key) for key in ("position_error", "dropped", "touched", "is_success"))
 
@@ -67,7 +70,8 @@ def roll_out(
         some = seeds[start : start + size]
         full = some + seeds[: size - len(some)]  # a batch always has the same size
         plans = [Plan(seed, "", pushes=draw_pushes(seed, rules.pushes * pushed)) for seed in full]
-        episodes = _roll_out(actor, env, plans, keep_pixels, delay, title)
+        with reuse_still_frames(actor) if device.type == "cpu" else nullcontext():
+            episodes = _roll_out(actor, env, plans, keep_pixels, delay, title)
         parts.append(episodes[: len(some)])
     return torch.cat(parts)
 

@@ -126,13 +126,15 @@ def evaluate_cell(config: Config, path: Path, result: dict, steps: int) -> None:
     """Evaluate a run under a condition with one delay, and add the cell to the file."""
     from dynmap_rl.evaluation.protocol import evaluate
     from dynmap_rl.paper.delays import CONDITIONS, frame_delay
+    from dynmap_rl.runs.lookup import find_run
     from dynmap_rl.utils.files import write_json
     from dynmap_rl.utils.version import find_commit
 
     _, _, pushed, stale = CONDITIONS[result["condition"]]
     delay = frame_delay(result["condition"], steps)
     actor, names = load_actor(config, result, None if stale else delay)
-    found = evaluate(actor, result["task"], config.eval, delay, pushed, config.compute.threads)["test"]
+    workers = config.compute.threads if has_world_model(find_run(result["run"])) else 1
+    found = evaluate(actor, result["task"], config.eval, delay, pushed, workers)["test"]
     cell = {name: found["summary"][name] for name in ("SR", "SR_interval", "DR", "DR_interval", "PE")}
     cell |= {"success": found["rows"]["success"], "commit": find_commit()}
     result |= names
