@@ -39,6 +39,7 @@ class JointLoss(LossModule):
         pixels: NestedKey = "pixels"
         action: NestedKey = "action"
         dynamics: NestedKey = "dynamics"
+        labelled: NestedKey = "labelled"
         goal: NestedKey = "goal"
         expert_action: NestedKey = "expert_action"
         disturbed: NestedKey = "disturbed"
