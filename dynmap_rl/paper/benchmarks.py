@@ -19,7 +19,7 @@ METHODS = {  # by the row of the table: recipe, its options, and rough minutes o
     "RGB+[P+V]": ("decoupled", ("--world_model.supervision", "position,velocity"), 12),
     "End-to-End": ("end_to_end", (), 15),
     "ACT": ("baseline", ("--policy", "act"), 60),
-    "Diffusion Policy": ("baseline", ("--policy", "diffusion"), 90),
+    "Diffusion Policy": ("baseline", ("--policy", "diffusion"), 65),
 }
 
 
