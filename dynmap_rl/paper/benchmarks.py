@@ -13,13 +13,13 @@ from .tables import join_table
 
 TASKS = "FetchPush", "FetchSlide", "PlateSlide", "Soccer"
 SEEDS = 0, 1, 2  # of weights and batches, of world models and policies
-METHODS = {  # by the row of the table: recipe, its options, and minutes of one core for a seed
-    "Only-RGB": ("decoupled", ("--world_model.supervision", "none"), 25),
-    "RGB+[P]": ("decoupled", ("--world_model.supervision", "position"), 25),
-    "RGB+[P+V]": ("decoupled", ("--world_model.supervision", "position,velocity"), 25),
-    "End-to-End": ("end_to_end", (), 35),
+METHODS = {  # by the row of the table: recipe, its options, and rough minutes of one core for a seed
+    "Only-RGB": ("decoupled", ("--world_model.supervision", "none"), 12),
+    "RGB+[P]": ("decoupled", ("--world_model.supervision", "position"), 12),
+    "RGB+[P+V]": ("decoupled", ("--world_model.supervision", "position,velocity"), 12),
+    "End-to-End": ("end_to_end", (), 15),
     "ACT": ("baseline", ("--policy", "act"), 60),
-    "Diffusion Policy": ("baseline", ("--policy", "diffusion"), 60),
+    "Diffusion Policy": ("baseline", ("--policy", "diffusion"), 65),
 }
 
 
