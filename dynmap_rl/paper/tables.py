@@ -131,7 +131,13 @@ def _others(task: str) -> list[str]:
 
 
 def _head(others: list[str]) -> list[str]:
-    return [*others, "SR [scenes]", "SR of each world model", "their mean [world models]", "world models, policies"]
+    return [
+        *others,
+        "SR [scenes]",
+        "SR of each world model",
+        "their mean [world models]",
+        "world models, policies",
+    ]
 
 
 def _numbers(cell: Cell, others: list[str]) -> list[str]:
