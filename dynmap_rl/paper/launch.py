@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from queue import SimpleQueue
 
@@ -91,10 +91,11 @@ def launch(
 ) -> list[str]:
     """Execute runs in order, and print the name of each that is done.
 
-    A run whose world model comes from another one of them waits for that run, and does not start if that one fails.
+    A run whose world model comes from another one of them waits for that run, while later ones go ahead, and does not
+    start if that one fails.
 
     Args:
-        runs: runs to execute; a world model's run comes before those that need it.
+        runs: runs to execute, first ones first; a world model's run comes before those that need it.
         start: function that executes a run and returns a message if it failed, such as :func:`execute` with its
             folders.
         launcher: ``local`` or ``ray``.
@@ -125,16 +126,22 @@ def launch_local(
     runs: Sequence[Run], start: Callable[[Run], str | None], workers: int = 1
 ) -> Iterator[tuple[Run, str | None]]:
     """Execute runs in threads, and yield them with their messages in the order in which they end."""
+    todo, running, failed, ended = list(runs), {}, set(), SimpleQueue()
     with ThreadPoolExecutor(workers) as pool:  # threads that wait for processes
-        futures, ended = {}, SimpleQueue()
-        for run in runs:  # started in order: a run that is waited for has begun
-            futures[run.name] = pool.submit(_after, futures.get(run.source), start, run)
-            futures[run.name].add_done_callback(ended.put)
-        running = dict(zip(futures.values(), runs, strict=True))
         try:
-            for _ in runs:
+            while todo or running:
+                open_names = {run.name for run in (*todo, *running.values())}
+                ready = [run for run in todo if run.source not in open_names]
+                for run in ready[: workers - len(running)]:
+                    todo.remove(run)
+                    future = pool.submit(_start, run.source in failed, start, run)
+                    running[future] = run
+                    future.add_done_callback(ended.put)
                 future = ended.get()
-                yield running[future], future.result()
+                run, message = running.pop(future), future.result()
+                if message:
+                    failed.add(run.name)
+                yield run, message
         except BaseException:  # Ctrl-C reaches the current runs too; no other may begin
             pool.shutdown(cancel_futures=True)
             raise
@@ -161,10 +168,6 @@ def launch_ray(
             yield run, f"{run.name} was lost by Ray ({type(error).__name__}); the same command resumes"
 
 
-def _after(needed: Future | None, start: Callable[[Run], str | None], run: Run) -> str | None:
-    return _start(needed and needed.result(), start, run)
-
-
-def _start(failed: str | None, start: Callable[[Run], str | None], run: Run) -> str | None:
+def _start(failed: bool | str | None, start: Callable[[Run], str | None], run: Run) -> str | None:
     """Execute a run, unless the run that it needs has failed."""
     return f"{run.name} needs the world model of a failed run" if failed else start(run)

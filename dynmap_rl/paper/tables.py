@@ -131,7 +131,13 @@ def _others(task: str) -> list[str]:
 
 
 def _head(others: list[str]) -> list[str]:
-    return [*others, "SR [scenes]", "SR of each world model", "their mean [world models]", "policies"]
+    return [
+        *others,
+        "SR [scenes]",
+        "SR of each world model",
+        "their mean [world models]",
+        "world models, policies",
+    ]
 
 
 def _numbers(cell: Cell, others: list[str]) -> list[str]:
@@ -146,7 +152,7 @@ def _numbers(cell: Cell, others: list[str]) -> list[str]:
         f"**{summary['SR']:.1f}** {_brackets(summary['SR_interval'])}",
         ", ".join(f"{rate:.1f}" for rate in rates),
         mean,
-        str(len(cell.policies)),
+        f"{len(rates)}, {len(cell.policies)}",
     ]
 
 

@@ -3,7 +3,6 @@
 import json
 import os
 import sys
-import time
 from pathlib import Path
 from threading import Event
 
@@ -94,15 +93,17 @@ def test_workers_run_at_the_same_time():
     assert launch(RUNS, wait_for_others, workers=3) == []
 
 
-def test_a_run_waits_for_the_world_model_that_it_needs():
-    runs, done = [RUNS[0], Run("d", "generalize", CELL, needs="a/seed_1"), RUNS[2]], []
+def test_a_run_waits_for_the_world_model_that_it_needs_while_others_go_ahead():
+    needing, begun, done = Run("d", "generalize", CELL, needs="a/seed_1"), Event(), []
 
     def start(run):
-        if run.name == "a":
-            time.sleep(0.2)
+        if run.name == "c":
+            begun.set()
+        message = None if run.name != "a" or begun.wait(20) else "c waits for nothing"
         done.append(run.name)
+        return message
 
-    assert launch(runs, start, workers=3) == []
+    assert launch([RUNS[0], needing, RUNS[2]], start, workers=2) == []
     assert done.index("a") < done.index("d")
 
 

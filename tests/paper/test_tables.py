@@ -36,7 +36,7 @@ def test_a_row_has_both_intervals_and_every_world_model(tmp_path):
     line = line_of(text, "RGB+[P]").split(" | ")
     assert line[1] == "92 (4.3); 4, 21" and line[3:5] == ["0.0", "10.0"]
     assert line[5].startswith("**60.0** [") and line[6] == "50.0, 60.0, 70.0"
-    assert line[7] == "60.0 [35.2, 84.8]" and line[8] == "9 |"
+    assert line[7] == "60.0 [35.2, 84.8]" and line[8] == "3, 9 |"
     assert line_of(markdown_overview(read_cells(tmp_path)), "RGB+[P]").startswith(
         "| RGB+[P] | 62 / - | 92 / **60.0** |"
     )
