@@ -102,8 +102,7 @@ def judge_policy(config: Config) -> tuple[Path, str, dict]:
     from dynmap_rl.reporting.media import film_policy
     from dynmap_rl.runs.lookup import find_run, task_of_run
 
-    delay = read_delay(config)
-    folder = find_run(config.policy)
+    delay, folder = read_delay(config), find_run(config.policy)
     task = config.task or task_of_run(folder) or "balance_reaching"
     description = get_task(task, from_file=not config.task).description
     actor = load_policy(config, folder, description)
