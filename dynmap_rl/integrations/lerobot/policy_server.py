@@ -5,13 +5,13 @@
 Options are those of ``lerobot.async_inference.policy_server``, which accepts only policies that are named in a list.
 """
 
-from lerobot.async_inference.constants import SUPPORTED_POLICIES
-from lerobot.async_inference.policy_server import serve
-
 from .configuration_dynmap import DynmapConfig
 
-if (name := DynmapConfig.get_choice_name(DynmapConfig)) not in SUPPORTED_POLICIES:
-    SUPPORTED_POLICIES.append(name)
-
 if __name__ == "__main__":
+    # Here, since LeRobot's discovery imports every module of this package, and these need the extra async.
+    from lerobot.async_inference.constants import SUPPORTED_POLICIES
+    from lerobot.async_inference.policy_server import serve
+
+    if (name := DynmapConfig.get_choice_name(DynmapConfig)) not in SUPPORTED_POLICIES:
+        SUPPORTED_POLICIES.append(name)
     serve()
