@@ -138,7 +138,7 @@ def add_dynamics(
         raise ValueError(f"--source must be one of {', '.join(SOURCES)}, got {source!r}")
     method = method or ("central" if source == "state" else "savgol")
     _check_method(method, window, order)
-    planar = meta is not None and get_task(meta["task"]).planar
+    planar = meta is not None and _is_planar(meta["task"])
     if source == "state":
         if noise < 0 or angle_noise < 0:
             raise ValueError(f"--noise and --angle_noise must be at least 0, got {noise} and {angle_noise}")
@@ -199,6 +199,14 @@ def _read_state(
     position += scale * np.random.default_rng(seed).standard_normal(position.shape)
     for episode, rows in spans(table["episode_index"].to_numpy()):
         yield episode, Motion(position[rows], angles, period)
+
+
+def _is_planar(task: str) -> bool:
+    """Return whether a task that a dataset names is known and in the plane; a dataset must not run code."""
+    try:
+        return get_task(task, from_file=True).planar
+    except ValueError:
+        return False
 
 
 def _describe(

@@ -157,7 +157,7 @@ def _roll_out_shard(shard: Shard) -> tuple[list[Plan], TensorDict]:
 
 def _count_rejected(shard: Shard) -> int:
     """Return how many candidates failed before the shard had its episodes; scenes are taken in order."""
-    if shard.kind == "exploration":
+    if shard.kind not in ("demonstrations", "undisturbed"):
         return 0
     first = _plan(shard, shard.number * CANDIDATES_PER_SHARD, 1)[0].scene_seed
     return read_json(shard.folder / ROWS, list)[-1]["scene_seed"] + 1 - first - shard.count
