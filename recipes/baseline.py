@@ -102,7 +102,6 @@ def check_lerobot() -> None:
 def train(config: Config, dataset: str | Path, folder: Path, seed: int, device: str) -> None:
     """Run or resume ``lerobot-train``, whose output is appended to ``lerobot.log``."""
     import shutil
-    from importlib.util import find_spec
 
     from dynmap_rl.data.format.reading import find_dataset, read_info, read_split
     from dynmap_rl.utils.processes import run_script
@@ -125,7 +124,7 @@ def train(config: Config, dataset: str | Path, folder: Path, seed: int, device: 
     folder.mkdir(parents=True, exist_ok=True)
     log = folder / "lerobot.log"
     print(f"seed {seed}: lerobot-train, see {log}", flush=True)
-    if run_script(Path(find_spec("lerobot.scripts.lerobot_train").origin), arguments, Path.cwd(), log):
+    if run_script(Path(sys.executable).with_name("lerobot-train"), arguments, Path.cwd(), log):
         last = (log.read_text(errors="replace").splitlines() or ["no output"])[-1]
         raise ValueError(f"lerobot-train failed; see {log}, which ends with: {last}")
 
