@@ -99,7 +99,8 @@ def _roll_out(
     sizes = {q: world_model.dynamics_decoder.normalizers[q].size for q in supervision}
     predicted = {quantity: torch.zeros(count, size, device=device) for quantity, size in sizes.items()}
     pushed, steps = any(plan.pushes for plan in plans), []
-    for t in tqdm(range(env.layout.steps), title, unit="step", leave=False, disable=title is None):
+    bar = {} if title else {"disable": True}  # False would override TQDM_DISABLE
+    for t in tqdm(range(env.layout.steps), title, unit="step", leave=False, **bar):
         dynamics = env.read_dynamics()
         td = actor(td)
         if pushed:

@@ -59,7 +59,8 @@ def execute(
         results: folder of the results.
         runs: folder of the runs; the recipe's output is appended to ``NAME.log`` beside the run.
         threads: threads of the recipe.
-        presets: folder with a settings file ``RECIPE.yaml`` for any of the recipes.
+        presets: folder with a settings file ``RECIPE.yaml`` for any of the recipes, and ``RECIPE_pretrained.yaml`` for
+            runs on the world model of another run.
         root: working directory of the recipe, to which the other folders are relative.
 
     Returns:
@@ -69,8 +70,9 @@ def execute(
     arguments = [*run.arguments, "--run", str(folder), "--compute.threads", str(threads)]
     if run.needs:
         arguments += ["--pretrained", str(runs / run.needs)]
-    if presets and (preset := root / presets / f"{run.recipe}.yaml").exists():
-        arguments += ["--config_path", str(preset)]
+    stems = [f"{run.recipe}_pretrained", run.recipe] if run.needs else [run.recipe]
+    found = [path for stem in stems if presets and (path := root / presets / f"{stem}.yaml").exists()]
+    arguments += ["--config_path", str(found[0])] if found else []
     log.parent.mkdir(parents=True, exist_ok=True)
     if run_script(recipes / f"{run.recipe}.py", arguments, root, log):
         last = (log.read_text(errors="replace").splitlines() or ["no output"])[-1]

@@ -81,7 +81,7 @@ def fit(
         truncate_metrics(folder, start)
     loss_module = share_gradients(loss_module, some=type(settings) is EndToEndTraining)
     part = slice(rank(), None, ranks())
-    bar = {"initial": start, "disable": rank() > 0}
+    bar = {"initial": start} | ({"disable": True} if rank() else {})  # False would override TQDM_DISABLE
     progress = tqdm(range(start, settings.updates), folder.name, settings.updates, **bar)
     for update in progress:
         set_learning_rate(optimizer, settings.learning_rate, update, settings.updates)

@@ -66,7 +66,8 @@ def map_processes(function: Callable, arguments: Sequence, count: int, title: st
     """
     from tqdm import tqdm
 
-    with tqdm(total=len(arguments), desc=title, leave=False, disable=title is None) as progress:
+    bar = {} if title else {"disable": True}  # False would override TQDM_DISABLE
+    with tqdm(total=len(arguments), desc=title, leave=False, **bar) as progress:
 
         def call(argument):
             value = function(argument)

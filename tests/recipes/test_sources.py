@@ -95,7 +95,7 @@ def test_real_cells(recordings, tmp_path, monkeypatch):
     results = {p.stem: read_json(p) for p in (tmp_path / "results").glob("*.json")}
     assert len(results) == 8 and all(r["test_protocol"]["episodes"] == 3 for r in results.values())
     measured = [json.loads(p.read_text()) for p in (tmp_path / "results/measures").glob("*.json")]
-    assert len(measured) == 4 and all(0 < m["open_loop_mm"] < 2000 for m in measured)
+    assert len(measured) == 4 and all(m["open_loop_mm"] > 0 for m in measured)
     assert read_json(tmp_path / f"datasets/sources/{TASK}_tracks.quality.json")["verdict"] in (
         "good",
         "doubtful",

@@ -21,9 +21,15 @@ from dynmap_rl.training.settings import EndToEndTraining, JointTraining, WorldMo
 from dynmap_rl.training.world_model import train_world_model
 from dynmap_rl.utils.ranks import join_ranks, leave_ranks, rank, ranks
 
-SIZES = {"updates": 20, "windows": 4, "window_steps": 5, "augmentation": Augmentation.off()}
+SIZES = {
+    "updates": 20,
+    "windows": 4,
+    "window_steps": 5,
+    "short_windows": 0,
+    "augmentation": Augmentation.off(),
+}
 ALL = {"rgb_frames": 1000}  # no frames are drawn at random
-WORLD_MODEL = WorldModelTraining("position", imagined=0, short_windows=0, **ALL, **SIZES)
+WORLD_MODEL = WorldModelTraining("position", imagined=0, **ALL, **SIZES)
 
 
 def die_at(update: int) -> None:
