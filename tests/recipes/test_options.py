@@ -30,7 +30,7 @@ def test_every_option_has_its_own_help(path):
 
 @pytest.mark.parametrize("preset", sorted(PRESETS.glob("*.yaml")), ids=lambda path: path.stem)
 def test_presets_fit_their_recipes(preset):
-    config_class = importlib.import_module(f"recipes.{preset.stem}").Config
+    config_class = importlib.import_module(f"recipes.{preset.stem.removesuffix('_pretrained')}").Config
     assert parse_settings(config_class, ["--config_path", str(preset)]) != config_class()
 
 
