@@ -181,6 +181,7 @@ def markdown_comparisons(comparisons: list[dict]) -> str:
             "",
             "DR" if claim == DROPS else "SR",
             "gap, points [scenes]",
+            "p",
             "scenes",
             "world models",
             "claim",

@@ -118,7 +118,13 @@ def markdown_tables(cells: Mapping[Key, Cell]) -> str:
 
 
 def join_table(head: list[str], rows: list[list[str]]) -> str:
-    """Return a table in Markdown."""
+    """Return a table in Markdown.
+
+    Raises:
+        ValueError: a row has not as many entries as the head.
+    """
+    if wrong := [row for row in rows if len(row) != len(head)]:
+        raise ValueError(f"rows must have {len(head)} entries, got {wrong[0]}")
     return "\n".join(f"| {' | '.join(line)} |" for line in (head, ["---"] * len(head), *rows))
 
 
@@ -185,7 +191,10 @@ def _notes(cells: Iterable[Cell]) -> str:
     part = sum(bool(cell.missing and cell.results) for cell in cells)
     text = f"{len(cells)} cells of {runs} runs."
     if missing:
-        text = f"Of {len(cells)} cells, {empty} are missing and {part} are incomplete: {missing} of {missing + runs} runs."
+        text = (
+            f"Of {len(cells)} cells, {empty} have no run yet and {part} have some of their runs: "
+            f"{missing} of {missing + runs} runs are missing."
+        )
     commits = count_commits(cells)
     if len(commits) > 1:
         made = ", ".join(f"{count} of `{commit}`" for commit, count in commits.most_common())

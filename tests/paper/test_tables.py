@@ -6,6 +6,7 @@ from made_up import TASK, write
 from dynmap_rl.paper.cells import TABLES
 from dynmap_rl.paper.results import COLUMNS, ROWS, read_cells
 from dynmap_rl.paper.tables import (
+    join_table,
     markdown_column,
     markdown_overview,
     markdown_own,
@@ -27,7 +28,12 @@ def test_cells_without_a_run_are_dashes_and_counted(tmp_path):
     beside_plain = 4
     assert len(rows) == 59 + len(ROWS) + beside_plain and all(" - " in line for line in rows)
     assert text.count("\nTable ") == sum(map(len, COLUMNS.values()))
-    assert "59 are missing" in markdown_overview(read_cells(tmp_path))
+    assert "159 of 159 runs" in markdown_overview(read_cells(tmp_path))
+
+
+def test_a_row_without_an_entry_for_every_column_is_refused():
+    with pytest.raises(ValueError, match="2 entries"):
+        join_table(["a", "b"], [["1", "2"], ["1", "2", "3"]])
 
 
 def test_a_row_has_both_intervals_and_every_world_model(tmp_path):
