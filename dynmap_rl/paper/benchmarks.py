@@ -13,13 +13,13 @@ from .tables import join_table
 
 TASKS = "FetchPush", "FetchSlide", "PlateSlide", "Soccer"
 SEEDS = 0, 1, 2  # of weights and batches, of world models and policies
-METHODS = {  # by the row of the table: recipe, its options, and rough minutes of one core for a seed
-    "Only-RGB": ("decoupled", ("--world_model.supervision", "none"), 12),
-    "RGB+[P]": ("decoupled", ("--world_model.supervision", "position"), 12),
-    "RGB+[P+V]": ("decoupled", ("--world_model.supervision", "position,velocity"), 12),
-    "End-to-End": ("end_to_end", (), 15),
-    "ACT": ("baseline", ("--policy", "act"), 60),
-    "Diffusion Policy": ("baseline", ("--policy", "diffusion"), 65),
+METHODS = {  # by the row of the table: recipe and its options
+    "Only-RGB": ("decoupled", ("--world_model.supervision", "none")),
+    "RGB+[P]": ("decoupled", ("--world_model.supervision", "position")),
+    "RGB+[P+V]": ("decoupled", ("--world_model.supervision", "position,velocity")),
+    "End-to-End": ("end_to_end", ()),
+    "ACT": ("baseline", ("--policy", "act")),
+    "Diffusion Policy": ("baseline", ("--policy", "diffusion")),
 }
 
 
@@ -27,7 +27,7 @@ def list_benchmarks(episodes: int = 500) -> dict[tuple[str, str, int], Run]:
     """Return the runs by task, method and seed; each trains from the start and evaluates on ``episodes`` scenes."""
     runs = {}
     for task in TASKS:
-        for method, (recipe, options, _) in METHODS.items():
+        for method, (recipe, options) in METHODS.items():
             for seed in SEEDS:
                 arguments = ["--task", f"mujoco:{task}", *options, "--seeds", str(seed)]
                 arguments += ["--world_model.seed", str(seed)] if recipe == "decoupled" else []

@@ -20,6 +20,7 @@ MINUTES = {  # of one of two busy cores
     "joint": 30,
     "end_to_end": 30,
     "generalize": 13,
+    "baseline": 60,
 }
 VALIDATION = "--eval.split", "validation", "--eval.paper_episodes", "0"
 UNDISTURBED = "datasets/balance_reaching_undisturbed"

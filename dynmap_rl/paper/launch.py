@@ -24,6 +24,14 @@ def has_run(name: str, runs: Path) -> bool:
     return (runs / name / "eval.json").exists()
 
 
+def print_runs(runs: Sequence[Run], todo: Sequence[Run]) -> None:
+    """Print all runs with the minutes of those that are to be executed, and the remaining time."""
+    for run in runs:
+        print(f"{f'{run.minutes:3} min' if run in todo else '   done'}  {run.name}")
+    hours, done = sum(run.minutes for run in todo) / 60, sum(run not in todo for run in runs)
+    print(f"{done} of {len(runs)} runs are complete; about {hours:.1f} hours of one core are left")
+
+
 def find_missing(runs: Path, names: Sequence[str]) -> list[str]:
     """Return and print which runs of a folder are not complete.
 

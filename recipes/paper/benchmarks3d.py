@@ -50,32 +50,26 @@ class Config:
 
 def main(config: Config) -> None:
     """Run the cells without a result, and write the table."""
-    from dynmap_rl.paper.benchmarks import METHODS, list_benchmarks
-    from dynmap_rl.paper.launch import execute, is_done, launch
+    from dynmap_rl.paper.benchmarks import list_benchmarks
+    from dynmap_rl.paper.launch import execute, is_done, launch, print_runs
 
     if config.write:
         return write(config)
-    cells = {key: c for key, c in list_benchmarks(config.episodes).items() if config.only in c.name}
+    cells = [cell for cell in list_benchmarks(config.episodes).values() if config.only in cell.name]
     if not cells:
         raise ValueError(f"--only must be a part of a cell's name, got {config.only!r}; see --dry_run")
-    todo = {key: cell for key, cell in cells.items() if not is_done(cell.name, config.results)}
+    todo = [cell for cell in cells if not is_done(cell.name, config.results)]
     if config.dry_run:
-        minutes = {key: METHODS[key[1]][2] for key in cells}
-        for key, cell in cells.items():
-            print(f"{f'{minutes[key]:3} min' if key in todo else '   done'}  {cell.name}")
-        hours = sum(minutes[key] for key in todo) / 60
-        done = len(cells) - len(todo)
-        print(f"{done} of {len(cells)} cells are complete; about {hours:.1f} hours of one core are left")
-        return None
+        return print_runs(cells, todo)
     from dynmap_rl.training.dataset import find_or_record
 
-    for task in sorted({cell.task for cell in todo.values()}):  # cells must not record at the same time
+    for task in sorted({cell.task for cell in todo}):  # cells must not record at the same time
         find_or_record(task)
     run = partial(
         execute, recipes=RECIPES, results=config.results, runs=config.runs,
         threads=2 if config.workers == 1 else 1, presets=config.presets, root=Path.cwd(),
     )  # fmt: skip
-    failed = launch(list(todo.values()), run, workers=config.workers)
+    failed = launch(todo, run, workers=config.workers)
     write(config)
     if failed:
         raise ValueError("; ".join(failed))

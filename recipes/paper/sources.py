@@ -60,7 +60,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Run the cells without a result, measure, and write."""
-    from dynmap_rl.paper.launch import execute, has_run, is_done, launch
+    from dynmap_rl.paper.launch import execute, has_run, is_done, launch, print_runs
     from dynmap_rl.paper.sources import make_datasets
 
     if config.write:
@@ -70,13 +70,7 @@ def main(config: Config) -> None:
     needed = {cell.needs for cell in todo if cell.needs and not has_run(cell.needs, config.runs)}
     todo = [cell for cell in cells if cell in todo or cell.name in needed]
     if config.dry_run:
-        for cell in cells:
-            print(f"{f'{cell.minutes:3} min' if cell in todo else '   done'}  {cell.name}")
-        hours = sum(cell.minutes for cell in todo) / 60
-        print(
-            f"{len(cells) - len(todo)} of {len(cells)} cells are complete; about {hours:.1f} hours of one core are left"
-        )
-        return None
+        return print_runs(cells, todo)
     make_datasets(todo, config.datasets, workers=2 if config.workers == 1 else config.workers)
     run = partial(
         execute, recipes=RECIPES, results=config.results, runs=config.runs,

@@ -21,7 +21,7 @@ from functools import partial
 from pathlib import Path
 
 from dynmap_rl.paper.cells import TABLES, UNDISTURBED, Run, list_runs
-from dynmap_rl.paper.launch import execute, has_run, is_done, launch
+from dynmap_rl.paper.launch import execute, has_run, is_done, launch, print_runs
 from dynmap_rl.utils.cli import command_line, refuse, run_recipe
 from dynmap_rl.utils.cluster import LAUNCHERS, check_launcher
 from dynmap_rl.utils.settings import check_at_least
@@ -81,7 +81,7 @@ def main(config: Config) -> None:
     refuse(config, Config(), ignored, f"--launcher {config.launcher}")
     chosen, todo = choose_runs(config)
     if config.dry_run:
-        return print_runs(chosen, todo)
+        return print_runs([run for run in list_runs() if run in chosen or run in todo], todo)
     if not todo:
         print(
             f"nothing to do: {len(chosen)} runs are in {config.results}; choose another --results for a new grid"
@@ -125,15 +125,6 @@ def record_datasets(runs: list[Run]) -> None:
         find_or_record(task)
     for task in {run.task for run in runs if run.dataset == UNDISTURBED}:
         record_dataset(UNDISTURBED, task, "undisturbed")
-
-
-def print_runs(chosen: list[Run], todo: list[Run]) -> None:
-    """Print all runs with their minutes, and the remaining time."""
-    done = [run for run in chosen if run not in todo]
-    for run in [run for run in list_runs() if run in chosen or run in todo]:
-        print(f"{f'{run.minutes:3} min' if run in todo else '   done'}  {run.name}")
-    hours = sum(run.minutes for run in todo) / 60
-    print(f"{len(done)} of {len(chosen)} runs are complete; about {hours:.1f} hours of one core are left")
 
 
 def print_tables(results: Path, form: str) -> None:
