@@ -29,7 +29,7 @@ def check_launcher(launcher: str) -> None:
 
 
 def connect() -> None:
-    """Connect to the Ray cluster of ``RAY_ADDRESS``, or start one on this machine."""
+    """Connect to the Ray cluster of ``RAY_ADDRESS``, or to one on this machine, started where there is none."""
     import ray
 
     if not ray.is_initialized():

@@ -26,8 +26,9 @@ def run(folder: Path, processes: int, *arguments: str, launcher: str = "torchrun
     else:
         command += ["-m", "torch.distributed.run", "--nproc_per_node", str(processes), "--standalone"]
     tests = os.pathsep.join([str(SCRIPT.parents[1]), *sys.path])
-    env = os.environ | {"PYTHONPATH": tests, "RAY_USAGE_STATS_ENABLED": "0"}
-    env.pop("RAY_ADDRESS", None)
+    # Without an address, Ray would look for the last cluster that was started on this machine.
+    ray = {"RAY_ADDRESS": "local", "RAY_USAGE_STATS_ENABLED": "0"}
+    env = os.environ | {"PYTHONPATH": tests} | ray
     for _ in range(3):  # Ray allows its processes 30 s to start, which a busy machine may exceed
         result = subprocess.run(
             [*command, str(SCRIPT), "--folder", str(folder), *arguments],
