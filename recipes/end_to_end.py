@@ -16,7 +16,8 @@ from pathlib import Path
 from dynmap_rl.evaluation.settings import Evaluation
 from dynmap_rl.training.settings import EndToEndTraining, PolicyArchitecture, WorldModelArchitecture
 from dynmap_rl.utils.cli import command_line, parse_seeds, run_recipe
-from dynmap_rl.utils.devices import Compute
+from dynmap_rl.utils.cluster import train_by_ray
+from dynmap_rl.utils.devices import RankedCompute
 
 
 @dataclass(frozen=True)
@@ -40,14 +41,16 @@ class Config:
     training: EndToEndTraining = EndToEndTraining()
     # Evaluation in closed loop.
     eval: Evaluation = Evaluation()
-    # Device and cores.
-    compute: Compute = Compute()
+    # Device, cores and processes.
+    compute: RankedCompute = RankedCompute()
     # Logger beside metrics.jsonl: tensorboard, wandb or trackio.
     logger: str | None = None
 
 
 def main(config: Config) -> None:
     """Train, evaluate and report."""
+    if config.compute.launcher == "ray":
+        return train_by_ray(main, config)
     from dynmap_rl.data.demonstrations import load_dataset, load_demonstrations
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.evaluation.protocol import judge_in_closed_loop

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from queue import SimpleQueue
 
-from dynmap_rl.utils.cluster import check_launcher
+from dynmap_rl.utils.cluster import check_launcher, connect
 from dynmap_rl.utils.files import read_json, write_json
 from dynmap_rl.utils.processes import run_script
 
@@ -163,8 +163,7 @@ def launch_ray(
     """Execute runs on a Ray cluster, and yield them with their messages in the order in which they end."""
     import ray
 
-    if not ray.is_initialized():
-        ray.init(log_to_driver=False)
+    connect()
     remote, refs = ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=0)(_start), {}
     for run in runs:  # Ray waits for the result that is an argument
         refs[run.name] = remote.remote(refs.get(run.source), start, run)

@@ -39,8 +39,8 @@ def fit(
 ) -> None:
     """Minimise a loss on random windows of episodes; a stopped run resumes from its last training state.
 
-    Under ``torchrun``, every process trains on its part of each batch, and the first one writes. A run may resume with
-    another number of processes.
+    Under ``torchrun`` or Ray Train, every process trains on its part of each batch, and the first one writes. A run may
+    resume with another number of processes.
 
     Args:
         model: all that is trained, changed in place.

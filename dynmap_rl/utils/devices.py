@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .cluster import check_launcher
 from .settings import check_at_least, check_choice
 
 if TYPE_CHECKING:
@@ -26,6 +27,25 @@ class Compute:
     def __post_init__(self):
         check_choice(self, "device", ("auto", "cpu", "cuda"))
         check_at_least(self, 1, "threads")
+
+
+@dataclass(frozen=True)
+class RankedCompute(Compute):
+    """Device and cores of a training by one process or, on a Ray cluster, by several (ranks)."""
+
+    # local (also under torchrun), or ray: ranks on a Ray cluster, with threads CPUs each, and a GPU each with cuda.
+    launcher: str = "local"
+    # Processes that train one model, with the launcher ray.
+    ranks: int = 1
+
+    def __post_init__(self):
+        super().__post_init__()
+        check_launcher(self.launcher)
+        check_at_least(self, 1, "ranks")
+        if self.launcher == "local" and self.ranks > 1:
+            raise ValueError(
+                "--compute.ranks has no effect with --compute.launcher local; choose ray, or use torchrun"
+            )
 
 
 def choose_device(name: str) -> torch.device:

@@ -1,4 +1,4 @@
-"""Several processes (ranks) that train one model, as ``torchrun`` starts them. Without it, there is one rank, 0.
+"""Several processes (ranks) that train one model, started by ``torchrun`` or Ray Train. Otherwise, there is one rank, 0.
 
 Torch is imported where it is used, so that ``--help`` is quick.
 """
@@ -17,10 +17,11 @@ if TYPE_CHECKING:
     import torch
 
 DIED = "another process of the run has ended; the same command resumes"
+TIMEOUT = timedelta(days=1)  # the first rank may record a dataset, or evaluate, while the others wait
 
 
 def join_ranks(device: str = "auto") -> None:
-    """Join the other processes of ``torchrun``; do nothing where there are none.
+    """Join the other processes of ``torchrun`` or Ray Train; do nothing where there are none.
 
     On GPUs, which NCCL connects, every process takes its own; processors are connected by Gloo.
 
@@ -34,13 +35,13 @@ def join_ranks(device: str = "auto") -> None:
 
     from .devices import choose_device
 
+    if distributed.is_initialized():  # Ray Train has joined them
+        return
     gpu = choose_device(device).type == "cuda"
     if gpu:
         torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(f"error: {DIED}"))  # torchrun ends the others
-    if not distributed.is_initialized():  # Ray Train has joined them
-        # The first rank may record a dataset, or evaluate, while the others wait.
-        distributed.init_process_group("nccl" if gpu else "gloo", timeout=timedelta(days=1))
+    distributed.init_process_group("nccl" if gpu else "gloo", timeout=TIMEOUT)
 
 
 def leave_ranks() -> int:

@@ -88,7 +88,7 @@ def test_a_complete_recording_is_left_as_it_is(recording):
 @pytest.mark.slow
 def test_ray_records_the_same_bits(recording, tmp_path, monkeypatch):
     ray = pytest.importorskip("ray")
-    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setenv("RAY_ADDRESS", "local")  # otherwise Ray joins a cluster of another test
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     monkeypatch.setattr(module, "SHARD_EPISODES", 2)
     try:

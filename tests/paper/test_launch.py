@@ -138,7 +138,7 @@ def test_launchers_are_checked(monkeypatch):
 @pytest.mark.slow
 def test_ray_reports_a_run_whose_process_died(monkeypatch):
     ray = pytest.importorskip("ray")
-    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setenv("RAY_ADDRESS", "local")  # otherwise Ray joins a cluster of another test
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
 
     def die_at_b(run):

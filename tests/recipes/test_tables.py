@@ -147,7 +147,7 @@ def test_real_cells(recordings, tmp_path):
 def test_ray_runs_the_same_cells(recordings, tmp_path, monkeypatch):
     pytest.importorskip("ray")
     commands.place_recordings(tmp_path, recordings, *TASKS[:2])
-    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setenv("RAY_ADDRESS", "local")  # otherwise Ray joins a cluster of another test
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     (tmp_path / "runs/tables" / NAMES[2]).mkdir(parents=True)
     (tmp_path / "runs/tables" / NAMES[2] / "config.json").write_text(

@@ -310,6 +310,7 @@ def test_no_display(place):
             "tables --launcher ray --only joint_none --results results",
             r"pip install '\.\[ray\]'",
         ),
+        ("ray", "joint --compute.launcher ray --compute.ranks 2", r"pip install '\.\[ray\]'"),
         ("dynmap_rl.integrations.lerobot", "evaluate --policy datasets", r"pip install '\.\[lerobot\]'"),
     ],
 )

@@ -1,13 +1,13 @@
-"""Train small models in each of three ways, in one process or under ``torchrun``.
+"""Train small models in each of three ways, in one process, under ``torchrun`` or by Ray.
 
-    torchrun --nproc_per_node 2 two_ranks.py FOLDER [UPDATE]
-
-With UPDATE, the last process dies there, in the training of the world model.
+torchrun --nproc_per_node 2 two_ranks.py --folder FOLDER
+python two_ranks.py --folder FOLDER --compute.launcher ray --compute.ranks 2
 """
 
 import os
 import signal
 import sys
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -19,6 +19,9 @@ from dynmap_rl.training import loop
 from dynmap_rl.training.joint import train_end_to_end, train_jointly
 from dynmap_rl.training.settings import EndToEndTraining, JointTraining, WorldModelTraining
 from dynmap_rl.training.world_model import train_world_model
+from dynmap_rl.utils.cli import run_recipe
+from dynmap_rl.utils.cluster import train_by_ray
+from dynmap_rl.utils.devices import RankedCompute
 from dynmap_rl.utils.ranks import join_ranks, leave_ranks, rank, ranks
 
 SIZES = {
@@ -30,6 +33,15 @@ SIZES = {
 }
 ALL = {"rgb_frames": 1000}  # no frames are drawn at random
 WORLD_MODEL = WorldModelTraining("position", imagined=0, **ALL, **SIZES)
+
+
+@dataclass(frozen=True)
+class Config:
+    folder: Path = Path("runs")
+    windows: int = 4
+    # Update in the training of the world model at which the last process dies.
+    update: int = 0
+    compute: RankedCompute = RankedCompute("cpu", threads=1)
 
 
 def die_at(update: int) -> None:
@@ -44,9 +56,10 @@ def die_at(update: int) -> None:
     loop.step = step_or_die
 
 
-def train(folder: Path) -> None:
+def train(folder: Path, windows: int) -> None:
     episodes = make_episodes(5)
-    train_world_model(make_model(), episodes, folder / "world_model", WORLD_MODEL, save_every=1)
+    settings = replace(WORLD_MODEL, windows=windows)
+    train_world_model(make_model(), episodes, folder / "world_model", settings, save_every=1)
     joint, end_to_end = JointTraining(**ALL, **SIZES), EndToEndTraining(**SIZES)
     for name, run, settings in (
         ("joint", train_jointly, joint),
@@ -57,19 +70,19 @@ def train(folder: Path) -> None:
         run(model, policy, episodes, folder / name, settings, save_every=1)
 
 
-def main(folder: Path, update: int = 0) -> None:
+def main(config: Config) -> None:
+    if config.compute.launcher == "ray":
+        return train_by_ray(main, config)
     torch.set_num_threads(1)
     # Gradients in bfloat16 are rounded, and those of halves of a batch otherwise than those of the whole.
     loop.mixed_precision = lambda device: torch.autocast("cpu", enabled=False)
     join_ranks("cpu")
-    if update:
-        die_at(update)
-    try:
-        train(folder)
-    except OSError as error:
-        sys.exit(f"error: {error}")
-    leave_ranks()
+    if config.update:
+        die_at(config.update)
+    train(config.folder, config.windows)
+    if not leave_ranks():
+        print(f"{sys.argv[0]}: done")
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), *map(int, sys.argv[2:]))
+    run_recipe(main, Config, sys.argv)

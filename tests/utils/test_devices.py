@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from dynmap_rl.utils.devices import Compute, choose_device, seed_everything
+from dynmap_rl.utils.devices import Compute, RankedCompute, choose_device, seed_everything
 
 
 def test_seeding_covers_every_generator():
@@ -29,3 +29,17 @@ def test_auto_is_the_gpu_where_there_is_one(monkeypatch, gpu):
 def test_settings_are_checked(settings):
     with pytest.raises(ValueError, match=rf"Compute\.{next(iter(settings))} must be"):
         Compute(**settings)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"launcher": "slurm"}, "launcher must be one of local, ray"),
+        ({"launcher": "ray", "ranks": 0}, "ranks must be at least 1"),
+        ({"ranks": 2}, r"--compute\.ranks has no effect with --compute\.launcher local"),
+    ],
+)
+def test_settings_of_ranks_are_checked(monkeypatch, settings, message):
+    monkeypatch.setattr("dynmap_rl.utils.cluster.find_spec", lambda name: name)
+    with pytest.raises(ValueError, match=message):
+        RankedCompute(**settings)
