@@ -17,8 +17,8 @@ from pathlib import Path
 from dynmap_rl.evaluation.settings import Evaluation
 from dynmap_rl.training.settings import PolicyTraining, WorldModelTraining
 from dynmap_rl.utils.cli import command_line, parse_seeds, refuse, run_recipe
-from dynmap_rl.utils.cluster import train_by_ray
 from dynmap_rl.utils.devices import RankedCompute
+from dynmap_rl.utils.ray_train import train_by_ray
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Config:
 def main(config: Config) -> None:
     """Train, evaluate and report."""
     if config.compute.launcher == "ray":
-        return train_by_ray(main, config)
+        return train_by_ray(main, config, sys.argv)
     import torch
 
     from dynmap_rl.data.demonstrations import load_demonstrations

@@ -20,9 +20,9 @@ from dynmap_rl.training.joint import train_end_to_end, train_jointly
 from dynmap_rl.training.settings import EndToEndTraining, JointTraining, WorldModelTraining
 from dynmap_rl.training.world_model import train_world_model
 from dynmap_rl.utils.cli import run_recipe
-from dynmap_rl.utils.cluster import train_by_ray
 from dynmap_rl.utils.devices import RankedCompute
 from dynmap_rl.utils.ranks import join_ranks, leave_ranks, rank, ranks
+from dynmap_rl.utils.ray_train import train_by_ray
 
 SIZES = {
     "updates": 20,
@@ -72,7 +72,7 @@ def train(folder: Path, windows: int) -> None:
 
 def main(config: Config) -> None:
     if config.compute.launcher == "ray":
-        return train_by_ray(main, config)
+        return train_by_ray(main, config, sys.argv)
     torch.set_num_threads(1)
     # Gradients in bfloat16 are rounded, and those of halves of a batch otherwise than those of the whole.
     loop.mixed_precision = lambda device: torch.autocast("cpu", enabled=False)
