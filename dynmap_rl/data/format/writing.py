@@ -172,7 +172,7 @@ def _without_cache():
     from datasets import Dataset, arrow_dataset
     from datasets.fingerprint import generate_random_fingerprint
     from datasets.table import embed_table_storage
-    from lerobot.datasets import compute_stats, io_utils
+    from lerobot.datasets import compute_stats, dataset_writer
 
     def embed_images(dataset):
         table = embed_table_storage(dataset.data.table)
@@ -185,7 +185,7 @@ def _without_cache():
     with (
         _replaced(compute_stats, "sample_images", sample_images),
         _replaced(arrow_dataset, "generate_fingerprint", lambda dataset: generate_random_fingerprint()),
-        _replaced(io_utils, "embed_images", embed_images),
+        _replaced(dataset_writer, "embed_images", embed_images),
     ):
         yield
 
