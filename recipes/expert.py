@@ -8,6 +8,7 @@ resumes a stopped run. To ship checkpoints with the package, copy them to ``dynm
 
 import sys
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from dynmap_rl.training.settings import PPOTraining
@@ -27,7 +28,7 @@ class Config:
     acceleration: float = 0.25
     # Training.
     ppo: PPOTraining = PPOTraining()
-    # With two threads, actor and critic learn at the same time; the result is the same.
+    # Processes that roll worlds out. With two or more, actor and critic learn at the same time. The result is the same.
     threads: int = 2
     # Logger beside metrics.jsonl: tensorboard, wandb or trackio.
     logger: str | None = None
@@ -37,6 +38,8 @@ def main(config: Config) -> None:
     """Train, judge and report."""
     import torch
 
+    from dynmap_rl.envs.task import Task
+    from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
     from dynmap_rl.envs.world import ACCELERATION_LIMIT
     from dynmap_rl.evaluation.experts import fresh_scenes, rates, rates_text
@@ -57,31 +60,32 @@ def main(config: Config) -> None:
     check_logger(config.logger)
     ppo = config.ppo
     torch.set_num_threads(1)  # these networks are too small for more
-    env = DynmapBatchedEnv(config.task, ppo.num_envs, control="acceleration")
+    task = get_task(config.task, kind=Task)
+    make_env = partial(DynmapBatchedEnv, config.task, control="acceleration")
     # A run may resume with more iterations.
     comparable = replace(config, ppo=replace(ppo, iterations=PPOTraining().iterations))
-    folder = config.run or Path("runs/expert") / env.task.name
+    folder = config.run or Path("runs/expert") / task.name
     open_run(folder, comparable, ignore=("run", "threads", "logger"))
     seed_everything(ppo.seed)
     limit = config.acceleration * ACCELERATION_LIMIT
-    network = ExpertNetwork(env.task.state_size, tuple(limit))
+    network = ExpertNetwork(task.state_size, tuple(limit))
 
     def judge(episodes: int) -> dict[str, float]:
-        return rates(env.task, roll_out(network, env.task, fresh_scenes(episodes)))
+        return rates(task, roll_out(network, task, fresh_scenes(episodes)))
 
     facts = {
         "task": config.task,
-        "state_size": env.task.state_size,
+        "state_size": task.state_size,
         "acceleration_limit": limit.tolist(),
         "hidden": 128,
     }
     common = {"threads": config.threads, "logger": config.logger}
-    train_ppo(env, network, folder, ppo, judge=judge, facts=facts, **common)
+    train_ppo(make_env, network, folder, ppo, judge=judge, facts=facts, **common)
     last = read_json(folder / "checkpoint" / f"{list_checkpoints(folder / 'checkpoint')[-1]}.json")
     seeds = fresh_scenes(ppo.eval_episodes)
-    success = [env.task.is_success(world) for world in roll_out(network, env.task, seeds)]
-    film(network, env.task, failures_first(seeds, success), folder / "rollouts.gif")
-    write_html(folder, f"Expert, {env.task.name}", rates_text(last), command_line(sys.argv))
+    success = [task.is_success(world) for world in roll_out(network, task, seeds)]
+    film(network, task, failures_first(seeds, success), folder / "rollouts.gif")
+    write_html(folder, f"Expert, {task.name}", rates_text(last), command_line(sys.argv))
     print(f"{rates_text(last)}\nwritten: {folder}")
 
 

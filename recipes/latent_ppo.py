@@ -9,6 +9,7 @@ the same scenes. The same command resumes a stopped run, and prints the result o
 
 import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from dynmap_rl.training.settings import PPOTraining
@@ -31,7 +32,7 @@ class Config:
     ppo: PPOTraining = PPOTraining(iterations=90, checkpoint_every=10)
     # Width of the network's hidden layers.
     hidden: int = 128
-    # Threads of torch.
+    # Threads of torch, and processes that roll worlds out.
     threads: int = 2
     # Logger beside metrics.jsonl: tensorboard, wandb or trackio.
     logger: str | None = None
@@ -76,8 +77,8 @@ def main(config: Config) -> None:
     torch.set_num_threads(config.threads)
 
     frozen_weights = fingerprint(world_model)
-    env = make_env(world_model, config.task, ppo.num_envs)
-    size = env.observation_spec["state"].shape[-1]
+    make = partial(make_env, world_model, config.task)
+    size = make(1).observation_spec["state"].shape[-1]
     seed_everything(ppo.seed)
     network = experts.ExpertNetwork(size, tuple(ACCELERATION_LIMIT), config.hidden)
 
@@ -87,7 +88,7 @@ def main(config: Config) -> None:
     facts = {"task": config.task, "state_size": size, "hidden": config.hidden}
     facts["acceleration_limit"] = ACCELERATION_LIMIT.tolist()
     common = {"threads": config.threads, "logger": config.logger}
-    train_ppo(env, network, folder, ppo, judge=judge, facts=facts, **common)
+    train_ppo(make, network, folder, ppo, judge=judge, facts=facts, **common)
     if fingerprint(world_model) != frozen_weights:
         raise ValueError("the frozen world model has changed; this run is not valid")
     states = rates(task, experts.roll_out(expert, task, fresh_scenes(ppo.final_episodes), states_of))

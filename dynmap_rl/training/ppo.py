@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import pickle
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch.nn.functional import smooth_l1_loss
@@ -16,20 +20,28 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 from tqdm import tqdm
 
-from dynmap_rl.envs.world import EPISODE_STEPS
 from dynmap_rl.experts.network import ExpertNetwork, make_actor
 from dynmap_rl.runs.folder import load_training_state, save_training_state, truncate_metrics
 from dynmap_rl.runs.loggers import log_metrics
 from dynmap_rl.utils.devices import seed_everything
 from dynmap_rl.utils.files import write_json
+from dynmap_rl.utils.processes import open_pool, share
 from dynmap_rl.utils.weights import save_weights
 
 from .loop import check_loss
 from .settings import PPOTraining
 
+GROUP = 48  # most worlds that a process rolls out together; larger groups are hardly faster
+KEYS = (
+    "state",
+    "action",
+    "action_log_prob",
+    *(("next", k) for k in ("state", "reward", "done", "terminated", "dropped")),
+)
+
 
 def train_ppo(
-    env: EnvBase,
+    make_env: Callable[[int], EnvBase],
     network: ExpertNetwork,
     folder: Path,
     settings: PPOTraining,
@@ -42,18 +54,22 @@ def train_ppo(
     """Train a network by PPO; a stopped run resumes from its last iteration, to the same weights.
 
     Args:
-        env: ``[N]`` worlds with ``state``, ``is_success`` and ``dropped``, controlled by accelerations.
+        make_env: picklable function that makes an environment of a number of worlds, with ``state``, ``is_success`` and
+            ``dropped``, controlled by accelerations.
         network: changed in place.
         folder: run folder; gets ``metrics.jsonl`` and, in ``checkpoint``, the training state and every
             ``checkpoint_every`` iterations ``iteration_NNN`` as safetensors and JSON.
         settings: of PPO.
         judge: function of a number of scenes to the rates of the mean action, at least ``success`` and ``drop``.
         facts: entries of the JSON of each checkpoint, beside those of ``judge``.
-        threads: with two, actor and critic learn at the same time; the weights are the same.
+        threads: number of processes that roll out worlds. With two or more, actor and critic learn at the same time,
+            in threads of this process. The weights are the same for any number. A script that uses more than one must
+            have the guard ``if __name__ == "__main__"``.
         logger: ``tensorboard``, ``wandb``, ``trackio`` or None.
 
     Raises:
         ValueError: the loss is not finite, or the training state is of an earlier release; the state is kept.
+        OSError: a process died.
     """
     folder = Path(folder)
     inputs, width = network.mlp[0].in_features, network.mlp[0].out_features
@@ -84,59 +100,86 @@ def train_ppo(
         start, seconds = state["iteration"], state["seconds"]
     truncate_metrics(folder, start)
 
-    # Every iteration starts from new, seeded scenes, so that a resumed run equals an uninterrupted one.
-    frames = env.batch_size.numel() * settings.steps
+    frames = settings.num_envs * settings.steps
     progress = tqdm(
         range(start, settings.iterations), initial=start, total=settings.iterations, unit="iteration"
     )
-    for iteration in progress:
-        began = time.perf_counter()
-        seed_everything(settings.seed + 1000 * (iteration + 1))
-        env.set_seed(settings.seed + 1000 * (iteration + 1))
-        for group in optimizer.param_groups:
-            group["lr"] = settings.learning_rate * (1 - 0.9 * iteration / settings.iterations)
-        batch = collect(env, network, settings.steps)
-        losses = update(batch, policy_loss, critic, advantage, optimizer, settings, threads)
-        seconds += time.perf_counter() - began
-        metrics = {
-            "frames": (iteration + 1) * frames,
-            "seconds": seconds,
-            "reward": batch["next", "reward"].mean(),
-            "drop": batch["next", "dropped"].any(1).float().mean(),
-            **losses,
-        }
-        log_metrics(folder, iteration + 1, logger, **metrics)
-        progress.set_postfix(reward=f"{metrics['reward']:.2f}", drop=f"{metrics['drop']:.2f}")
-        last = iteration + 1 == settings.iterations
-        if last or (iteration + 1) % settings.checkpoint_every == 0:
-            judged = judge(settings.final_episodes if last else settings.eval_episodes)
-            path = folder / "checkpoint" / f"iteration_{iteration + 1:03d}"
-            save_weights(path.with_suffix(".safetensors"), network)
-            at = {"iteration": iteration + 1, "frames": metrics["frames"], "seconds": round(seconds, 1)}
-            write_json(path.with_suffix(".json"), judged | facts | at)
-            progress.write(
-                f"iteration {iteration + 1}: success {judged['success']:.1%}, drop {judged['drop']:.1%}"
+    with open_pool(threads - 1, "the same command resumes") if threads > 1 else nullcontext() as pool:
+        for iteration in progress:
+            began = time.perf_counter()
+            for group in optimizer.param_groups:
+                group["lr"] = settings.learning_rate * (1 - 0.9 * iteration / settings.iterations)
+            batch = collect(make_env, network, settings, iteration, pool)
+            seed_everything(settings.seed + 1000 * (iteration + 1))
+            losses = update(batch, policy_loss, critic, advantage, optimizer, settings, threads)
+            seconds += time.perf_counter() - began
+            metrics = {
+                "frames": (iteration + 1) * frames,
+                "seconds": seconds,
+                "reward": batch["next", "reward"].mean(),
+                "drop": batch["next", "dropped"].any(1).float().mean(),
+                **losses,
+            }
+            log_metrics(folder, iteration + 1, logger, **metrics)
+            progress.set_postfix(reward=f"{metrics['reward']:.2f}", drop=f"{metrics['drop']:.2f}")
+            last = iteration + 1 == settings.iterations
+            if last or (iteration + 1) % settings.checkpoint_every == 0:
+                judged = judge(settings.final_episodes if last else settings.eval_episodes)
+                path = folder / "checkpoint" / f"iteration_{iteration + 1:03d}"
+                save_weights(path.with_suffix(".safetensors"), network)
+                at = {"iteration": iteration + 1, "frames": metrics["frames"], "seconds": round(seconds, 1)}
+                write_json(path.with_suffix(".json"), judged | facts | at)
+                rates = f"success {judged['success']:.1%}, drop {judged['drop']:.1%}"
+                progress.write(f"iteration {iteration + 1}: {rates}")
+            save_training_state(
+                state_path,
+                networks=networks.state_dict(),
+                optimizer=optimizer.state_dict(),
+                iteration=iteration + 1,
+                seconds=seconds,
             )
-        save_training_state(
-            state_path,
-            networks=networks.state_dict(),
-            optimizer=optimizer.state_dict(),
-            iteration=iteration + 1,
-            seconds=seconds,
-        )
+
+
+def collect(
+    make_env: Callable[[int], EnvBase],
+    network: ExpertNetwork,
+    settings: PPOTraining,
+    iteration: int,
+    pool: ProcessPoolExecutor | None = None,
+) -> TensorDictBase:
+    """Roll out the worlds of an iteration in groups, by the processes of a pool and this one, ``[N, T]``."""
+    count = -(-settings.num_envs // GROUP)
+    sizes = [len(group) for group in torch.arange(settings.num_envs).tensor_split(count)]
+    # Everything random follows from seed, iteration and group, so that a resumed run equals an uninterrupted one.
+    draws = np.random.SeedSequence((settings.seed, iteration)).generate_state(count).tolist()
+    work = partial(explore, make_env, pickle.dumps(network), settings.steps)
+    return torch.cat([pickle.loads(part) for part in share(pool, work, list(zip(sizes, draws, strict=True)))])
 
 
 @torch.no_grad()
-def collect(env: EnvBase, network: ExpertNetwork, steps: int = EPISODE_STEPS) -> TensorDictBase:
-    """Roll out a number of steps from new scenes, ``[N, T]``, with actions drawn from the network's distribution."""
+def explore(make_env: Callable[[int], EnvBase], network: bytes, steps: int, group: tuple[int, int]) -> bytes:
+    """Roll out a group, its number of worlds and its seed, from new scenes with actions drawn from the network.
 
-    def act(td: TensorDictBase) -> TensorDictBase:
-        return td.set("action", torch.normal(*network(td["state"])))
+    Network and result are pickled: as values of another process, each of their tensors would hold a file open.
+    """
+    (worlds, seed), network = group, pickle.loads(network)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # processes share the cores, and a sum's last bit may depend on the threads
+    try:
+        env = make_env(worlds)
+        env.set_seed(seed)
+        generator = torch.Generator().manual_seed(seed)
 
-    batch = env.rollout(steps, act, break_when_any_done=False)
-    # All probabilities at once: one distribution a step takes longer than the network.
-    distribution = IndependentNormal(*network(batch["state"]))
-    return batch.set("action_log_prob", distribution.log_prob(batch["action"]))
+        def act(td: TensorDictBase) -> TensorDictBase:
+            return td.set("action", torch.normal(*network(td["state"]), generator=generator))
+
+        batch = env.rollout(steps, act, break_when_any_done=False)
+        # All probabilities at once: one distribution a step takes longer than the network.
+        distribution = IndependentNormal(*network(batch["state"]))
+        batch["action_log_prob"] = distribution.log_prob(batch["action"])
+        return pickle.dumps(batch.select(*KEYS))
+    finally:
+        torch.set_num_threads(threads)
 
 
 def update(

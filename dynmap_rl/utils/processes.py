@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import runpy
 import signal
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -33,18 +34,33 @@ def run_processes(stages: Sequence[Callable[[tuple], None]], arguments: list[tup
             for stage in stages:
                 stage(one)
         return
+    with open_pool(count, "the same command resumes") as pool:
+        running = {pool.submit(stages[0], one): (one, stages[1:]) for one in arguments}
+        while running:
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                one, later = running.pop(future)
+                future.result()
+                if later:
+                    running[pool.submit(later[0], one)] = one, later[1:]
+
+
+@contextlib.contextmanager
+def open_pool(count: int, advice: str) -> Iterator[ProcessPoolExecutor]:
+    """Open a pool of processes until the end of the block; an error in the block cancels what has not begun.
+
+    Args:
+        count: number of processes.
+        advice: what to do where a process dies, a part of the message.
+
+    Raises:
+        OSError: a process died.
+    """
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(count, mp_context=context, initializer=start_worker) as pool:
         try:
-            running = {pool.submit(stages[0], one): (one, stages[1:]) for one in arguments}
-            while running:
-                for future in wait(running, return_when=FIRST_COMPLETED).done:
-                    one, later = running.pop(future)
-                    future.result()
-                    if later:
-                        running[pool.submit(later[0], one)] = one, later[1:]
+            yield pool
         except BrokenProcessPool as error:
-            raise OSError("a process died, perhaps for want of memory; the same command resumes") from error
+            raise OSError(f"a process died, perhaps for want of memory; {advice}") from error
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
@@ -68,33 +84,46 @@ def map_processes(function: Callable, arguments: Sequence, count: int, title: st
 
     bar = {} if title else {"disable": True}  # False would override TQDM_DISABLE
     with tqdm(total=len(arguments), desc=title, leave=False, **bar) as progress:
-
-        def call(argument):
-            value = function(argument)
-            progress.update()
-            return value
-
         if min(count, len(arguments)) <= 1:
-            return [call(one) for one in arguments]
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(count - 1, mp_context=context, initializer=start_worker) as pool:
-            try:
-                futures = [pool.submit(function, one) for one in arguments]
-                pairs = zip(arguments[::-1], futures[::-1], strict=True)
-                own = [call(one) for one, future in pairs if future.cancel()]  # not taken by another process
-                values = []
-                for future in futures:
-                    if future.cancelled():
-                        values.append(own.pop())
-                    else:
-                        values.append(future.result())
-                        progress.update()
-                return values
-            except BrokenProcessPool as error:
-                raise OSError("a process died, perhaps for want of memory; use fewer threads") from error
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
+            return share(None, function, arguments, progress.update)
+        with open_pool(count - 1, "use fewer threads") as pool:
+            return share(pool, function, arguments, progress.update)
+
+
+def share(
+    pool: ProcessPoolExecutor | None,
+    function: Callable,
+    arguments: Sequence,
+    done: Callable[[], object] = lambda: None,
+) -> list:
+    """Return ``function(argument)`` for each argument, computed by the processes of a pool and by this one.
+
+    Args:
+        pool: see :func:`open_pool`; None leaves everything to this process.
+        function: picklable function.
+        arguments: what the function is called with. The pool takes from the front, and this process from the end.
+        done: called after each argument.
+    """
+
+    def call(argument):
+        value = function(argument)
+        done()
+        return value
+
+    if pool is None:
+        return [call(one) for one in arguments]
+    *others, last = arguments  # a pool takes one more than it has processes, which cannot be taken back
+    futures = [pool.submit(function, one) for one in others]
+    own = [call(last)]
+    own += [call(one) for one, future in zip(others[::-1], futures[::-1], strict=True) if future.cancel()]
+    values = []
+    for future in futures:
+        if future.cancelled():
+            values.append(own.pop())
+        else:
+            values.append(future.result())
+            done()
+    return values + own
 
 
 def start_worker() -> None:

@@ -1,9 +1,14 @@
 """PPO: it resumes to the same weights, on any number of threads, and stops where the loss is not finite."""
 
+import os
+import time
+from functools import partial
+
 import pytest
 import torch
 from safetensors.torch import load_file
 
+from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.envs.world import ACCELERATION_LIMIT
 from dynmap_rl.experts.network import ExpertNetwork
@@ -12,20 +17,30 @@ from dynmap_rl.training import PPOTraining, ppo, train_ppo
 from dynmap_rl.utils.devices import seed_everything
 from dynmap_rl.utils.files import read_json
 
-SIZES = {"num_envs": 2, "iterations": 2, "epochs": 1, "minibatch": 120, "checkpoint_every": 1}
+SIZES = {"num_envs": 3, "iterations": 2, "epochs": 1, "minibatch": 120, "checkpoint_every": 1}
 SETTINGS = PPOTraining(**SIZES, eval_episodes=3, final_episodes=4)
 WEIGHTS = "checkpoint/iteration_002.safetensors"
 
 
-def train(folder, settings=SETTINGS, threads=1):
-    env = DynmapBatchedEnv("balance_reaching", settings.num_envs, control="acceleration")
+@pytest.fixture(scope="module", autouse=True)
+def small_groups():
+    """Divide three worlds into two groups, for two processes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ppo, "GROUP", 2)
+        yield
+
+
+MAKE_ENV = partial(DynmapBatchedEnv, "balance_reaching", control="acceleration")
+
+
+def train(folder, settings=SETTINGS, threads=1, make_env=MAKE_ENV):
     seed_everything(settings.seed)
-    network = ExpertNetwork(env.task.state_size, tuple(ACCELERATION_LIMIT), 16)
+    network = ExpertNetwork(get_task("balance_reaching").state_size, tuple(ACCELERATION_LIMIT), 16)
 
     def judge(episodes):
         return {"episodes": episodes, "success": 0.0, "drop": 0.0}
 
-    train_ppo(env, network, folder, settings, judge=judge, facts={"task": "mine"}, threads=threads)
+    train_ppo(make_env, network, folder, settings, judge=judge, facts={"task": "mine"}, threads=threads)
 
 
 def metrics(folder):
@@ -42,8 +57,8 @@ def finished(tmp_path_factory):
 
 def test_checkpoints_and_metrics(finished):
     assert [(row["step"], row["frames"]) for row in metrics(finished)] == [
-        (1, 2 * SETTINGS.steps),
-        (2, 4 * SETTINGS.steps),
+        (1, 3 * SETTINGS.steps),
+        (2, 6 * SETTINGS.steps),
     ]
     facts = [read_json(finished / f"checkpoint/iteration_00{i}.json") for i in (1, 2)]
     assert [(f["iteration"], f["episodes"], f["task"]) for f in facts] == [(1, 3, "mine"), (2, 4, "mine")]
@@ -68,7 +83,7 @@ def test_a_killed_training_resumes_to_the_same_weights(finished, tmp_path, monke
     assert (tmp_path / WEIGHTS).read_bytes() == (finished / WEIGHTS).read_bytes()
 
 
-def test_threads_change_no_weight(finished, tmp_path):
+def test_the_number_of_processes_changes_no_weight(finished, tmp_path):
     train(tmp_path, threads=2)
     assert metrics(tmp_path) == metrics(finished)
     assert (tmp_path / WEIGHTS).read_bytes() == (finished / WEIGHTS).read_bytes()
@@ -96,3 +111,18 @@ def test_a_loss_that_is_not_finite_keeps_the_last_state(tmp_path, monkeypatch):
     weights = load_file(tmp_path / "checkpoint/iteration_001.safetensors")
     assert all(value.isfinite().all() for value in weights.values())
     assert [row["step"] for row in metrics(tmp_path)] == [1]
+
+
+def exit_elsewhere(num_envs, own):
+    """Make an environment in the process ``own``, and end any other one."""
+    if os.getpid() != own:
+        os._exit(1)
+    time.sleep(1)  # until the other process has taken its share
+    return DynmapBatchedEnv("balance_reaching", num_envs, control="acceleration")
+
+
+def test_a_process_that_dies_is_an_error_and_the_training_resumes(finished, tmp_path):
+    with pytest.raises(OSError, match="a process died"):
+        train(tmp_path, threads=2, make_env=partial(exit_elsewhere, own=os.getpid()))
+    train(tmp_path)
+    assert (tmp_path / WEIGHTS).read_bytes() == (finished / WEIGHTS).read_bytes()
