@@ -18,17 +18,20 @@ import dynmap_rl  # noqa: F401  (registers the ids)
 from dynmap_rl.envs.scene import scene_seed
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.world import ACCELERATION_LIMIT, EPISODE_STEPS
+from dynmap_rl.training.settings import PPOTraining
 
 GOAL = 0.97
+ACCELERATION = 0.25  # share of the limits, as in the recipe
+LIMIT = (ACCELERATION * ACCELERATION_LIMIT).astype(np.float32)
 EXPERT = Path(__file__).parents[2] / "recipes" / "expert.py"
 
 
-def ours(seed: int, iterations: int, num_envs: int, episodes: int, threads: int = 2) -> float:
+def ours(seed: int, settings: PPOTraining, episodes: int, threads: int = 2) -> float:
     """Run ``recipes/expert.py``, which writes its seconds and success rates, and stop it at the goal."""
     with tempfile.TemporaryDirectory() as folder:
         sizes = {
-            "ppo.seed": seed, "threads": threads, "ppo.iterations": iterations, "ppo.num_envs": num_envs,
-            "ppo.checkpoint_every": 1, "ppo.eval_episodes": episodes, "ppo.final_episodes": episodes,
+            "ppo.seed": seed, "threads": threads, "ppo.iterations": settings.iterations,
+            "ppo.num_envs": settings.num_envs, "acceleration": ACCELERATION, "ppo.checkpoint_every": 1, "ppo.eval_episodes": episodes, "ppo.final_episodes": episodes,
         }  # fmt: skip
         command = [sys.executable, str(EXPERT), "--run", folder]
         command += [f"--{name}={size}" for name, size in sizes.items()]
@@ -48,8 +51,8 @@ def _reached(folder: str) -> float:
     return next((f["seconds"] for f in facts if f["success"] >= GOAL), math.inf)
 
 
-def stable_baselines(seed: int, iterations: int, num_envs: int, episodes: int, threads: int = 2) -> float:
-    """Run Stable-Baselines3's PPO on the Gymnasium id, with the same settings and threads."""
+def stable_baselines(seed: int, settings: PPOTraining, episodes: int, threads: int = 2) -> float:
+    """Run Stable-Baselines3's PPO on the Gymnasium id, with the same settings, limits and threads."""
     from stable_baselines3 import PPO
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.env_util import make_vec_env
@@ -81,37 +84,44 @@ def stable_baselines(seed: int, iterations: int, num_envs: int, episodes: int, t
         for _ in range(EPISODE_STEPS):
             action, _ = model.predict(np.stack([task.state(w) for w in worlds]), deterministic=True)
             for world, a in zip(worlds, action, strict=True):
-                world.accelerate(a * ACCELERATION_LIMIT)
+                world.accelerate(a * LIMIT)
         return sum(task.is_success(world) for world in worlds) / len(worlds)
 
     def make():
         env = gym.make("dynmap_rl/BalanceReaching-v1", obs_type="state", control="acceleration")
-        return gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
+        space = gym.spaces.Box(-1, 1, env.action_space.shape)
+        return gym.wrappers.TransformAction(env, lambda a: a * LIMIT, space)
 
     model = PPO(
         "MlpPolicy",
-        make_vec_env(make, num_envs, seed=seed),
-        learning_rate=lambda left: 5e-4 * (0.1 + 0.9 * left),
-        n_steps=EPISODE_STEPS,
-        batch_size=1024,
-        n_epochs=10,
-        gamma=0.97,
-        gae_lambda=0.95,
-        clip_range=0.2,
-        ent_coef=1e-3,
+        make_vec_env(make, settings.num_envs, seed=seed),
+        learning_rate=lambda left: settings.learning_rate * (0.1 + 0.9 * left),
+        n_steps=settings.steps,
+        batch_size=settings.minibatch,
+        n_epochs=settings.epochs,
+        gamma=settings.gamma,
+        gae_lambda=settings.gae_lambda,
+        clip_range=settings.clip,
+        ent_coef=settings.entropy,
         vf_coef=1.0,
-        policy_kwargs={"net_arch": [128, 128], "activation_fn": torch.nn.Tanh, "log_std_init": -0.7},
+        policy_kwargs={"net_arch": [128, 128], "activation_fn": torch.nn.Tanh, "log_std_init": -1.2},
         seed=seed,
         device="cpu",
     )
     watch = Watch()
-    model.learn(iterations * num_envs * EPISODE_STEPS, callback=watch)
+    model.learn(settings.iterations * settings.num_envs * settings.steps, callback=watch)
     return watch.reached
 
 
-def ppo(seeds=(0, 1, 2), iterations: int = 45, num_envs: int = 64, episodes: int = 200) -> dict:
-    """Return the seconds to the goal, the median over seeds; infinite where the frames were not enough."""
-    sizes = iterations, num_envs, episodes
-    pairs = [(ours(seed, *sizes), stable_baselines(seed, *sizes)) for seed in seeds]
+def ppo(seeds=(0, 1, 2), episodes: int = 200, **sizes: int) -> dict:
+    """Return the seconds to the goal, the median over seeds; infinite where the frames were not enough.
+
+    Args:
+        seeds: one pair of runs each.
+        episodes: scenes on which every iteration is judged.
+        sizes: settings that differ from the recipe's.
+    """
+    settings = PPOTraining(**sizes)
+    pairs = [(ours(seed, settings, episodes), stable_baselines(seed, settings, episodes)) for seed in seeds]
     a, b = (float(np.median(times)) for times in zip(*pairs, strict=True))
     return {"ours": a, "theirs": b, "ratio": a / b, "pairs": pairs}
