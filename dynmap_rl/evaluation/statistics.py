@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from statistics import NormalDist
 
 import numpy as np
-from scipy.stats import binom, bootstrap, norm, t
+
+# SciPy is imported where it is used: it takes a second, also in every process of an evaluation.
 
 
 def summarize(rows: list[dict]) -> dict[str, float]:
@@ -49,7 +51,7 @@ def summarize_seeds(rows_by_seed: list[list[dict]]) -> dict[str, tuple[float, fl
 
 def wilson(successes: float, count: float) -> tuple[float, float]:
     """Return the 95 % Wilson interval of a rate, in %; SciPy has it for whole numbers only."""
-    rate, z = successes / count, float(norm.ppf(0.975))
+    rate, z = successes / count, NormalDist().inv_cdf(0.975)
     middle = rate + z**2 / (2 * count)
     half = z * (rate * (1 - rate) / count + z**2 / (4 * count**2)) ** 0.5
     low, high = (100 * (middle + sign * half) / (1 + z**2 / count) for sign in (-1, 1))
@@ -83,6 +85,8 @@ def student_interval(rates: Sequence[float]) -> tuple[float, float] | None:
     Returns:
         The ends, within 0 and 100 %; None for fewer than two rates.
     """
+    from scipy.stats import t
+
     count = len(rates)
     if count < 2:
         return None
@@ -107,6 +111,8 @@ def rate_gap(rows_a: list[list[dict]], rows_b: list[list[dict]], outcome: str = 
     Raises:
         ValueError: the two were not evaluated on the same scenes.
     """
+    from scipy.stats import bootstrap
+
     scenes = [[row["scene_seed"] for row in rows] for rows in (*rows_a, *rows_b)]
     if any(s != scenes[0] for s in scenes):
         raise ValueError(
@@ -133,6 +139,8 @@ def exchange_p(differences: np.ndarray) -> float:
 
     The result is exact. SciPy's permutation test draws a sample and takes a thousand times as long.
     """
+    from scipy.stats import binom
+
     sizes, counts = np.unique(np.abs(differences[differences != 0]), return_counts=True)
     unit = max(np.gcd.reduce(sizes, initial=0), 1)
     chances = np.ones(1)  # of the sums, in steps of the unit
