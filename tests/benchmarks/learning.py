@@ -24,13 +24,15 @@ SUPERVISION = ("position", "velocity")
 def world_model_training(
     dataset: str, decode_all: bool = True, count: int = 16, steps: int = 24, updates: int = 10
 ) -> dict:
-    """Frames a second of a training step of ``recipes/decoupled.py``, against the same model in plain float32 with
-    LSTM cells in a time loop, which decodes every frame (or as many as the recipe does)."""
+    """Frames a second of a training step of ``recipes/decoupled.py`` with the paper's plain CNNs, against the same model
+    in plain float32 with LSTM cells in a time loop, which decodes every frame (or as many as the recipe does)."""
     torch.set_num_threads(2)
     episodes = load_dataset(dataset, "train")
     constants = load_meta(dataset)["normalization"]
     windows = sample_windows(episodes, count, steps, torch.Generator().manual_seed(0))
-    fast = make_world_model(constants, SUPERVISION).to(memory_format=torch.channels_last)
+    fast = make_world_model(constants, SUPERVISION, architecture="plain").to(
+        memory_format=torch.channels_last
+    )
     loss_module = WorldModelLoss(fast, rgb_frames=128, generator=torch.Generator())
     optimizer = make_optimizer(fast, 1e-4, 1e-4)
 
@@ -43,7 +45,7 @@ def world_model_training(
 
         return updates * count * steps / seconds(run)
 
-    slow = PlainWorldModel(make_world_model(constants, SUPERVISION))
+    slow = PlainWorldModel(make_world_model(constants, SUPERVISION, architecture="plain"))
     plain_optimizer = torch.optim.AdamW(slow.parameters(), 1e-4)
 
     def plain():

@@ -31,9 +31,11 @@ SMALL = {
     "windows": {"batches": 1},
     "to_tensordict": {"count": 10},
     "evaluation": {"episodes": 2, "single": 1},
+    "recording": {"episodes": 1},
+    "evaluating": {"episodes": 2},
     "onnx": {"steps": 2},
     "import": {},
-    "help": {"pattern": "tables.py"},
+    "help": {"pattern": "paper/tables.py"},
 }
 
 
@@ -49,7 +51,7 @@ def test_the_plain_world_model_is_the_same_model(load, recording):
     """Loss and gradients, in float32 and with every frame decoded."""
     torch.manual_seed(0)
     windows = sample_windows(load_dataset(recording, "train"), 2, 5, torch.Generator().manual_seed(0))
-    model = make_world_model(load_meta(recording)["normalization"], DYNAMICS)
+    model = make_world_model(load_meta(recording)["normalization"], DYNAMICS, architecture="plain")
     plain = load("learning").PlainWorldModel(model)
     ours, theirs = sum(WorldModelLoss(model)(windows).values()), plain.loss(windows, None)
     torch.testing.assert_close(theirs, ours, rtol=1e-5, atol=0)
@@ -69,7 +71,7 @@ def test_the_plain_world_model_is_the_same_model(load, recording):
 def test_every_row_runs(load, recording, tmp_path, monkeypatch, row):
     """Once, in a minimal size, and without processes that import everything again."""
 
-    def compare(ours, theirs, repeats=1):
+    def compare(ours, theirs, repeats=1, warm=False):
         a, b = ours(), theirs()
         return {"ours": a, "theirs": b, "ratio": a / b}
 
@@ -88,7 +90,7 @@ def test_every_row_runs(load, recording, tmp_path, monkeypatch, row):
         pytest.importorskip("stable_baselines3")
         monkeypatch.setattr(load("ppo"), "GOAL", 0.0)
         monkeypatch.setattr(subprocess, "run", run_here)
-    for name in ("deploying", "learning", "loading", "simulation", "starting"):
+    for name in ("deploying", "learning", "loading", "parallel", "simulation", "starting"):
         monkeypatch.setattr(load(name), "compare", compare)
     run = load("run")
     monkeypatch.setattr(run, "DATASET", str(recording))

@@ -7,15 +7,19 @@ import time
 from collections.abc import Callable
 
 
-def compare(ours: Callable[[], float], theirs: Callable[[], float], repeats: int = 9) -> dict[str, float]:
+def compare(
+    ours: Callable[[], float], theirs: Callable[[], float], repeats: int = 9, warm: bool = True
+) -> dict[str, float]:
     """Return the medians of two functions' numbers, and the median of ours / theirs over the pairs.
 
     Args:
         ours: function that does its work and returns a number, seconds or a rate.
         theirs: the same for what it is compared with.
         repeats: number of pairs.
+        warm: call both once before.
     """
-    ours(), theirs()  # warm
+    if warm:
+        ours(), theirs()
     pairs = [(ours(), theirs()) for _ in range(repeats)]
     return {
         "ours": statistics.median(a for a, _ in pairs),
