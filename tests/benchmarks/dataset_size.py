@@ -6,7 +6,8 @@
 Datasets are copies of the episodes of a recording, one after the other; the row ``two_cameras`` has two cameras of
 128 x 128 pixels, whose frames are those of the recording, enlarged. ``cold`` decodes the dataset into its cache, ``warm``
 maps the cache. Memory is the largest private memory of the process (``RssAnon``), without the pages of the cache, which the
-operating system can drop. Writes ``recipes/results/measurements/dataset_size.json``.
+operating system can drop. Writes ``recipes/results/measurements/dataset_size.json`` and
+``recipes/results/media/dataset_size.png``; ``--draw`` writes the figure alone, from the stored numbers.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import cv2
+import matplotlib
 import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
@@ -32,10 +34,11 @@ from dynmap_rl.data.format.reading import decode_image
 from dynmap_rl.envs.task import LAYOUT
 from dynmap_rl.keys import CAMERA, CAMERAS
 from dynmap_rl.utils.cli import command_line
-from dynmap_rl.utils.files import write_json
+from dynmap_rl.utils.files import read_json, write_json
 from dynmap_rl.utils.version import find_commit
 
 RESULT = Path(__file__).parents[2] / "recipes/results/measurements/dataset_size.json"
+FIGURE = RESULT.parents[1] / "media/dataset_size.png"
 WINDOWS, STEPS, DRAWS = 12, 24, 300
 SECOND, SIDE = f"{CAMERAS}side", 128
 
@@ -156,6 +159,31 @@ def run(source: Path, folder: Path, count: int, enlarge: bool = False, in_memory
     return row
 
 
+def draw(rows: dict[str, dict], path: Path) -> None:
+    """Draw memory against the number of episodes."""
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    rows = [row for name, row in rows.items() if name.isdigit()]
+    episodes = [row["episodes"] for row in rows]
+    figure, axes = pyplot.subplots(figsize=(6, 4), layout="constrained")
+    axes.loglog(
+        episodes, [row["cache_MB"] for row in rows], "s--", color="gray", label="decoded frames, on disk"
+    )
+    axes.loglog(
+        episodes, [row["cold"]["private_MB"] for row in rows], "o-", label="private memory, first load"
+    )
+    axes.loglog(
+        episodes, [row["warm"]["private_MB"] for row in rows], "o-", label="private memory, later loads"
+    )
+    axes.set(xlabel="episodes", ylabel="MB", ylim=(100, None))
+    axes.set_xticks(episodes, [f"{count:,}" for count in episodes])
+    axes.minorticks_off()
+    axes.grid(alpha=0.3)
+    axes.legend()
+    figure.savefig(path, dpi=120)
+
+
 def main() -> None:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
@@ -166,7 +194,10 @@ def main() -> None:
     )
     parser.add_argument("--folder", type=Path, help="folder for the datasets; by default a temporary one")
     parser.add_argument("--output", type=Path, default=RESULT)
+    parser.add_argument("--draw", action="store_true", help="write the figure alone")
     options = parser.parse_args()
+    if options.draw:
+        return draw(read_json(options.output)["rows"], FIGURE)
     rows = {}
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
         counts = [int(count) for count in options.episodes.split(",")]
@@ -177,6 +208,7 @@ def main() -> None:
             rows["two_cameras"] = run(options.dataset, Path(folder), options.two_cameras, enlarge=True)
             print("two_cameras", rows["two_cameras"], flush=True)
     write_json(options.output, {"rows": rows, "command": command_line(sys.argv), "commit": find_commit()})
+    return draw(rows, FIGURE)
 
 
 if __name__ == "__main__":

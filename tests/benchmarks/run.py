@@ -31,6 +31,7 @@ from dynmap_rl.utils.files import read_json, write_bytes, write_json
 RESULTS = Path(__file__).parents[2] / "recipes/results/measurements" / "benchmarks.json"
 MAIN_JOBS = RESULTS.with_name("main_job_time.json")
 MEMORY, SOAK = RESULTS.with_name("memory.json"), RESULTS.with_name("soak.json")
+SIZES = RESULTS.with_name("dataset_size.json")
 PAGE = Path(__file__).with_name("README.md")
 START, END = "<!-- written by tests/benchmarks/run.py --write -->", "<!-- end -->"
 DATASET = "datasets/balance_reaching"
@@ -108,6 +109,26 @@ def memory_table(memory: dict) -> str:
     return "\n".join(lines + [f"| `{name}` | {peak:.1f} |" for name, peak in memory["peak"].items()])
 
 
+def size_table(sizes: dict) -> str:
+    """Return load times, rates of windows and memory by the size of the dataset; later loads after the slash."""
+    lines = [
+        "| episodes | parquet files | decoded, on disk | load (s) | windows/s | private memory (MB) |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name, row in sizes["rows"].items():
+        cold, warm = row["cold"], row["warm"]
+        what = f"{row['episodes']:,}" + ("" if name.isdigit() else ", two cameras of 128 x 128")
+        disk = f"{row['files_MB']:,.0f} MB | {row['cache_MB'] / 1000:,.1f} GB"
+        load = f"{cold['load_s']:.1f} / {warm['load_s']:.2f}"
+        rate = f"{cold['windows_per_s']:,.0f} / {warm['windows_per_s']:,.0f}"
+        lines.append(
+            f"| {what} | {disk} | {load} | {rate} | {cold['private_MB']:.0f} / {warm['private_MB']:.0f} |"
+        )
+    if memory := next((r["warm"].get("windows_per_s_in_memory") for r in sizes["rows"].values()), None):
+        lines.append(f"\nFrom a copy in memory, the smallest one gives {memory:,.0f} windows/s.")
+    return "\n".join(lines)
+
+
 def soak_text(soak: dict) -> str:
     """Return the held memory at the beginning and the end of the soak test."""
     first, last = soak["held_mb"][0], soak["held_mb"][-1]
@@ -121,6 +142,7 @@ def page(text: str) -> str:
         speed_table(read_json(RESULTS)),
         main_job_table(read_json(MAIN_JOBS)),
         memory_table(read_json(MEMORY)),
+        size_table(read_json(SIZES)),
         soak_text(read_json(SOAK)),
     )
     before, _, rest = text.partition(START)
