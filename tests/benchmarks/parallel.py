@@ -22,7 +22,8 @@ def recording(episodes: int = 300) -> dict:
             sizes = {"episodes": episodes, "eval_episodes": 1, "workers": workers}
             return seconds(lambda: record_dataset(Path(folder) / "recording", **sizes))
 
-    return compare(lambda: record(2), lambda: record(1), repeats=1, warm=False)
+    found = compare(lambda: record(2), lambda: record(1), repeats=1, warm=False)
+    return found | {"episodes": episodes + 1}
 
 
 def evaluation(episodes: int = 1000) -> dict:

@@ -126,9 +126,17 @@ def test_the_plan_follows_from_the_stored_numbers(load, tmp_path):
         "warm": {"private_MB": 400},
     }
     write_json(tmp_path / "dataset_size.json", {"rows": {"100": size}})
-    write_json(tmp_path / "updates_cpu.json", {"device": "here", "rows": [{"frames_per_s": 1000}]})
-    needs = " ".join(planning.list_needs(tmp_path, 1_000_000).values())
-    assert [word in needs for word in ("30 GB", "1,500 GB", "5.6 hours", "33 hours")] == [True] * 4
+    rate = {"device": "here", "threads": 2, "rows": [{"frames_per_s": 1000}]}
+    write_json(tmp_path / "updates_cpu.json", rate)
+    write_json(tmp_path / "benchmarks.json", {"rows": {"recording": {"episodes": 100, "theirs": 18}}})
+    prices = planning.Prices(core_hour=0.1, gb_month=0.01)
+    needs = planning.list_needs(tmp_path, 1_000_000, prices)
+    text = " ".join(need for need, _ in needs.values())
+    assert [word in text for word in ("50 hours", "30 GB", "1,500 GB", "5.6 hours", "33 hours")] == [True] * 5
+    costs = {need.split(",")[0]: cost for need, (_, cost) in needs.items()}
+    assert costs["recording"] == pytest.approx(5)
+    assert costs["decoded frames"] == pytest.approx(15)
+    assert costs["training"] == pytest.approx(33.33 * 2 * 0.1, rel=1e-3)
 
 
 def test_commands_of_other_scripts_are_understood(load):

@@ -201,7 +201,7 @@ def main() -> None:
                 rows.append(measure(device, windows, mixed, compiled, options.updates, peak))
                 print(rows[-1], flush=True)
     name = torch.cuda.get_device_name() if device.type == "cuda" else f"{options.threads} threads"
-    result = {"device": name, "convolution_peak_flops": peaks, "rows": rows}
+    result = {"device": name, "threads": options.threads, "convolution_peak_flops": peaks, "rows": rows}
     result |= {"command": command_line(sys.argv), "commit": find_commit()}
     write_json(options.output or RESULTS / f"updates_{device.type}.json", result)
 
