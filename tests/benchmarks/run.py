@@ -23,6 +23,7 @@ import learning
 import loading
 import parallel
 import ppo
+import ranks
 import simulation
 import starting
 
@@ -69,6 +70,7 @@ ROWS = {
     ),
     "recording": ("recording 300 demonstrations, two processes", "one", "s", 1, "ours < 45 s", parallel.recording),
     "evaluating": ("evaluation of 1,000 episodes, two processes", "one", "s", 1, "ours < 20 s", parallel.evaluation),
+    "ranks": ("update of a world model, two processes under `torchrun`", "one process with two threads", "s", 1, "", ranks.two_ranks),
     "onnx": ("control step in onnxruntime, one core", "the same in PyTorch", "ms", MS, "", deploying.onnx),
     "import": ("`import dynmap_rl`", "`import gymnasium`", "s", 1, "ours < 0.3 s", starting.import_package),
     "help": ("`--help` of the slowest recipe", "`import torch`", "s", 1, "ours < 1 s", starting.show_help),

@@ -33,6 +33,7 @@ SMALL = {
     "evaluation": {"episodes": 2, "single": 1},
     "recording": {"episodes": 1},
     "evaluating": {"episodes": 2},
+    "ranks": {"updates": (1, 2), "repeats": 1},
     "onnx": {"steps": 2},
     "import": {},
     "help": {"pattern": "paper/tables.py"},
@@ -90,7 +91,7 @@ def test_every_row_runs(load, recording, tmp_path, monkeypatch, row):
         pytest.importorskip("stable_baselines3")
         monkeypatch.setattr(load("ppo"), "GOAL", 0.0)
         monkeypatch.setattr(subprocess, "run", run_here)
-    for name in ("deploying", "learning", "loading", "parallel", "simulation", "starting"):
+    for name in ("deploying", "learning", "loading", "parallel", "ranks", "simulation", "starting"):
         monkeypatch.setattr(load(name), "compare", compare)
     run = load("run")
     monkeypatch.setattr(run, "DATASET", str(recording))

@@ -2,10 +2,12 @@
 
 import json
 
+import datasets
 import numpy as np
 
 from dynmap_rl.data.demonstrations import load_dataset
 from dynmap_rl.data.format.writing import make_features
+from dynmap_rl.data.recording.record import record_dataset
 from dynmap_rl.envs.task import LAYOUT
 from dynmap_rl.keys import DYNAMICS
 
@@ -50,3 +52,14 @@ def test_statistics_of_the_episodes_are_those_of_float64(recording):
     std = np.stack(table["stats/observation.state/std"])
     assert (std[:, 3:] >= 0).all() and (std[:, 3:] < 1e-7).all()  # constant in an episode; float32 gives 1e-4
     np.testing.assert_allclose(np.stack(table["stats/observation.state/mean"])[:, 3:], goals, rtol=1e-9)
+
+
+def test_images_are_embedded_at_once(tmp_path, monkeypatch):
+    """LeRobot embeds them row by row, both of an episode and of a merged file, which takes longer than the simulation."""
+
+    def refuse(*_, **__):
+        raise AssertionError("row by row")
+
+    monkeypatch.setattr(datasets.Dataset, "map", refuse)
+    record_dataset(tmp_path / "recording", episodes=1, eval_episodes=1, workers=1)
+    assert len(load_dataset(tmp_path / "recording")) == 2

@@ -172,7 +172,7 @@ def _without_cache():
     from datasets import Dataset, arrow_dataset
     from datasets.fingerprint import generate_random_fingerprint
     from datasets.table import embed_table_storage
-    from lerobot.datasets import compute_stats, dataset_writer
+    from lerobot.datasets import compute_stats, dataset_writer, io_utils
 
     def embed_images(dataset):
         table = embed_table_storage(dataset.data.table)
@@ -185,7 +185,8 @@ def _without_cache():
     with (
         _replaced(compute_stats, "sample_images", sample_images),
         _replaced(arrow_dataset, "generate_fingerprint", lambda dataset: generate_random_fingerprint()),
-        _replaced(dataset_writer, "embed_images", embed_images),
+        _replaced(dataset_writer, "embed_images", embed_images),  # of an episode
+        _replaced(io_utils, "embed_images", embed_images),  # of a merged file
     ):
         yield
 
