@@ -6,7 +6,6 @@ import pickle
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 
@@ -104,7 +103,7 @@ def train_ppo(
     progress = tqdm(
         range(start, settings.iterations), initial=start, total=settings.iterations, unit="iteration"
     )
-    with open_pool(threads - 1, "the same command resumes") if threads > 1 else nullcontext() as pool:
+    with open_pool(threads - 1, "the same command resumes") as pool:
         for iteration in progress:
             began = time.perf_counter()
             for group in optimizer.param_groups:

@@ -45,22 +45,27 @@ def run_processes(stages: Sequence[Callable[[tuple], None]], arguments: list[tup
 
 
 @contextlib.contextmanager
-def open_pool(count: int, advice: str) -> Iterator[ProcessPoolExecutor]:
+def open_pool(count: int, advice: str) -> Iterator[ProcessPoolExecutor | None]:
     """Open a pool of processes until the end of the block; an error in the block cancels what has not begun.
+
+    The pool is None where the number is not above 0.
 
     Args:
         count: number of processes.
         advice: what to do where a process dies, a part of the message.
 
     Raises:
-        OSError: a process died.
+        ChildProcessError: a process died.
     """
+    if count < 1:
+        yield None
+        return
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(count, mp_context=context, initializer=start_worker) as pool:
         try:
             yield pool
         except BrokenProcessPool as error:
-            raise OSError(f"a process died, perhaps for want of memory; {advice}") from error
+            raise ChildProcessError(f"a process died, perhaps for want of memory; {advice}") from error
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
@@ -83,18 +88,18 @@ def map_processes(function: Callable, arguments: Sequence, count: int, title: st
     from tqdm import tqdm
 
     bar = {} if title else {"disable": True}  # False would override TQDM_DISABLE
-    with tqdm(total=len(arguments), desc=title, leave=False, **bar) as progress:
-        if min(count, len(arguments)) <= 1:
-            return share(None, function, arguments, progress.update)
-        with open_pool(count - 1, "use fewer threads") as pool:
-            return share(pool, function, arguments, progress.update)
+    with (
+        tqdm(total=len(arguments), desc=title, leave=False, **bar) as progress,
+        open_pool(min(count, len(arguments)) - 1, "use fewer threads") as pool,
+    ):
+        return share(pool, function, arguments, lambda argument: progress.update())
 
 
 def share(
     pool: ProcessPoolExecutor | None,
     function: Callable,
     arguments: Sequence,
-    done: Callable[[], object] = lambda: None,
+    done: Callable[[object], object] = lambda argument: None,
 ) -> list:
     """Return ``function(argument)`` for each argument, computed by the processes of a pool and by this one.
 
@@ -102,12 +107,12 @@ def share(
         pool: see :func:`open_pool`; None leaves everything to this process.
         function: picklable function.
         arguments: what the function is called with. The pool takes from the front, and this process from the end.
-        done: called after each argument.
+        done: called with each argument when its value is there.
     """
 
     def call(argument):
         value = function(argument)
-        done()
+        done(argument)
         return value
 
     if pool is None:
@@ -117,12 +122,12 @@ def share(
     own = [call(last)]
     own += [call(one) for one, future in zip(others[::-1], futures[::-1], strict=True) if future.cancel()]
     values = []
-    for future in futures:
+    for argument, future in zip(others, futures, strict=True):
         if future.cancelled():
             values.append(own.pop())
         else:
             values.append(future.result())
-            done()
+            done(argument)
     return values + own
 
 

@@ -32,7 +32,7 @@ from dynmap_rl.utils.files import read_json, write_bytes, write_json
 RESULTS = Path(__file__).parents[2] / "recipes/results/measurements" / "benchmarks.json"
 MAIN_JOBS = RESULTS.with_name("main_job_time.json")
 MEMORY, SOAK = RESULTS.with_name("memory.json"), RESULTS.with_name("soak.json")
-SIZES = RESULTS.with_name("dataset_size.json")
+SIZES, UPDATES = RESULTS.with_name("dataset_size.json"), RESULTS.with_name("updates_cpu.json")
 PAGE = Path(__file__).with_name("README.md")
 START, END = "<!-- written by tests/benchmarks/run.py --write -->", "<!-- end -->"
 DATASET = "datasets/balance_reaching"
@@ -86,7 +86,8 @@ def speed_table(results: dict) -> str:
     for name, (what, against, unit, factor, goal, _) in ROWS.items():
         if row := results["rows"].get(name):
             ours, theirs = (f"{row[key] * factor:.3g} {unit}" for key in ("ours", "theirs"))
-            former = f"{row['former']:.2f}" if "former" in row else ""
+            former = results.get("first_release", {}).get(name)  # ratios
+            former = "" if former is None else f"{former:.2f}"
             lines.append(
                 f"| {what} | {against} | {ours} | {theirs} | **{row['ratio']:.2f}** | {former} | {goal} |"
             )
@@ -131,6 +132,29 @@ def size_table(sizes: dict) -> str:
     return "\n".join(lines)
 
 
+def updates_table(found: dict) -> str:
+    """Return what an update of a world model takes, and what it spends the time on."""
+    families = list(found["rows"][0]["breakdown"])
+    lines = [
+        f"| precision, windows | ms | frames/s | share of peak | {' | '.join(families)} |",
+        "|---" * (4 + len(families)) + "|",
+    ]
+    for row in found["rows"]:
+        precision = "bfloat16" if row["mixed"] else "float32"
+        parts = " | ".join(f"{100 * row['breakdown'].get(family, 0):.0f} %" for family in families)
+        share = f"{100 * row['share_of_convolution_peak']:.0f} %"
+        lines.append(
+            f"| {precision}, {row['windows']} | {row['ms']:.0f} | {row['frames_per_s']:,.0f} | {share} | {parts} |"
+        )
+    peaks = " and ".join(
+        f"{peak / 1e9:.0f} GFLOP/s in {name}" for name, peak in found["convolution_peak_flops"].items()
+    )
+    return (
+        "\n".join(lines)
+        + f"\n\nThe peak, the fastest of a few large convolutions, is {peaks} ({found['device']})."
+    )
+
+
 def soak_text(soak: dict) -> str:
     """Return the held memory at the beginning and the end of the soak test."""
     first, last = soak["held_mb"][0], soak["held_mb"][-1]
@@ -145,6 +169,7 @@ def page(text: str) -> str:
         main_job_table(read_json(MAIN_JOBS)),
         memory_table(read_json(MEMORY)),
         size_table(read_json(SIZES)),
+        updates_table(read_json(UPDATES)),
         soak_text(read_json(SOAK)),
     )
     before, _, rest = text.partition(START)
@@ -168,9 +193,6 @@ def main(names: list[str]) -> None:
     for name in names or ROWS:
         print(name, flush=True)
         if row := ROWS[name][-1]():
-            old = results["rows"].get(name)
-            if old:  # the row of the first release
-                row["former"] = old.get("former", old["ratio"])
             results["rows"][name] = row | {"date": f"{date.today()}", "commit": commit()}
             results["machine"] = platform.platform()
             write_json(RESULTS, results)

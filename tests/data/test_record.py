@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import time
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import pytest
@@ -163,7 +162,7 @@ def test_two_recordings_of_one_folder_are_refused(tmp_path):
         record_dataset(tmp_path / "d", episodes=1, eval_episodes=1)
 
 
-@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), BrokenProcessPool("died")])
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), ChildProcessError("died")])
 def test_a_full_disk_or_a_lost_worker_is_one_clear_error(tmp_path, monkeypatch, error):
     def fail(*args):
         raise error

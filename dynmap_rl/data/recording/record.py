@@ -6,11 +6,8 @@ its finished shards, and the same call resumes. The result depends neither on in
 
 from __future__ import annotations
 
-import multiprocessing
 import shutil
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable
 from pathlib import Path
 
 from tqdm import tqdm
@@ -18,7 +15,7 @@ from tqdm import tqdm
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.utils.cluster import check_launcher, run_by_ray
 from dynmap_rl.utils.files import read_json, write_json
-from dynmap_rl.utils.processes import start_worker
+from dynmap_rl.utils.processes import open_pool, share
 
 from ..demonstrations import FORMAT, META, load_meta
 from .plans import find_checkpoints
@@ -47,7 +44,7 @@ def record_dataset(
             pushes) or ``exploration`` (noise and detours, all episodes).
         episodes: number of episodes of the split ``train``.
         eval_episodes: number of episodes of the split ``eval``.
-        workers: number of processes; 1 records in this process. A script that uses more must have the guard
+        workers: number of processes, this one included. A script that uses more must have the guard
             ``if __name__ == "__main__"``.
         expert: folder of the expert's checkpoints; by default the expert that ships for the task.
         launcher: ``local``, or ``ray`` for one CPU of a Ray cluster a shard; the folder must be shared by its machines.
@@ -80,7 +77,7 @@ def record_dataset(
         raise ValueError(
             f"{root} is being recorded by another process; wait for that process or stop it"
         ) from error
-    except BrokenProcessPool as error:
+    except ChildProcessError as error:
         raise OSError(
             f"a worker died while recording {root}; repeat the call with fewer workers, finished episodes are kept"
         ) from error
@@ -132,8 +129,7 @@ def _record(root: Path, parts: Path, settings: dict, workers: int, launcher: str
     todo = [shard for shard in shards if not shard.folder.exists()]
     total, left = (sum(shard.count for shard in s) for s in (shards, todo))
     with tqdm(total=total, initial=total - left, unit="episode", desc=f"recording {root.name}") as progress:
-        for shard in _run_shards(todo, workers, launcher):
-            progress.update(shard.count)
+        _run_shards(todo, workers, launcher, lambda shard: progress.update(shard.count))
     merged = parts / "merged.tmp"
     merge_shards(shards, merged, settings)
     merged.replace(root)
@@ -155,26 +151,12 @@ def _plan_shards(parts: Path, settings: dict) -> list[Shard]:
     ]
 
 
-def _run_shards(shards: list[Shard], workers: int, launcher: str) -> Iterator[Shard]:
-    """Record shards and yield each when it is complete."""
+def _run_shards(shards: list[Shard], workers: int, launcher: str, done: Callable[[Shard], object]) -> None:
+    """Record shards, and call ``done`` with each that is complete."""
     if launcher == "ray":
         for shard, end in run_by_ray(record_shard, shards):
             end()
-            yield shard
+            done(shard)
         return
-    workers = min(workers, len(shards))
-    if workers <= 1:
-        for shard in shards:
-            record_shard(shard)
-            yield shard
-        return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=start_worker) as pool:
-        futures = {pool.submit(record_shard, shard): shard for shard in shards}
-        try:
-            for future in as_completed(futures):
-                future.result()
-                yield futures[future]
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+    with open_pool(min(workers, len(shards)) - 1, "use fewer workers") as pool:
+        share(pool, record_shard, shards, done)
