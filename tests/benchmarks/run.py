@@ -61,7 +61,7 @@ ROWS = {
         lambda **sizes: loading.window_sampling(DATASET, **sizes),
     ),
     "to_tensordict": (
-        "dataset to TensorDict, frames/s", "iterating `LeRobotDataset`", "1/s", 1, ">= 10",
+        "dataset to TensorDict, mapped from its cache, frames/s", "iterating `LeRobotDataset`", "1/s", 1, ">= 10",
         lambda **sizes: loading.to_tensordict(DATASET, **sizes),
     ),
     "evaluation": (
