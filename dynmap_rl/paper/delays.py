@@ -98,6 +98,7 @@ def plot_delays(results: list[dict], path: Path) -> None:
         columns,
         figsize=(4.2 * columns, 3 * rows + 1.2),
         squeeze=False,
+        sharex=True,
         sharey=True,
         layout="constrained",
     )

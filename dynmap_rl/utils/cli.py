@@ -188,7 +188,7 @@ def parse_seeds(text: str) -> list[int]:
 
 
 def command_line(argv: Sequence[str]) -> str:
-    """Return the command of a recipe as it is given in the root of the repository."""
+    """Return the command of a recipe or a benchmark as it is given in the root of the repository."""
     parts = Path(argv[0]).resolve().parts
-    start = len(parts) - 1 - parts[::-1].index("recipes") if "recipes" in parts else -1
+    start = max((i for i, part in enumerate(parts) if part in ("recipes", "tests")), default=-1)
     return shlex.join(["python", "/".join(parts[start:]), *argv[1:]])
