@@ -33,6 +33,7 @@ RESULTS = Path(__file__).parents[2] / "recipes/results/measurements" / "benchmar
 MAIN_JOBS = RESULTS.with_name("main_job_time.json")
 MEMORY, SOAK = RESULTS.with_name("memory.json"), RESULTS.with_name("soak.json")
 SIZES, UPDATES = RESULTS.with_name("dataset_size.json"), RESULTS.with_name("updates_cpu.json")
+LATENCY = RESULTS.with_name("realtime.json")
 PAGE = Path(__file__).with_name("README.md")
 START, END = "<!-- written by tests/benchmarks/run.py --write -->", "<!-- end -->"
 DATASET = "datasets/balance_reaching"
@@ -155,6 +156,22 @@ def updates_table(found: dict) -> str:
     )
 
 
+def latency_table(found: dict) -> str:
+    """Return the time from a frame to its action on one core."""
+    names = {
+        "actor": "shipped actor",
+        "onnx": "the same in onnxruntime",
+        "delayed": "the same on frames 300 ms old, rolled forward",
+        "act": "ACT, chunks of 20, a new one after 10 steps",
+        "diffusion": "Diffusion Policy, 10 DDIM steps, a new chunk after 8 steps",
+    }
+    lines = ["| control step on one core | p50 (ms) | p99 (ms) | worst (ms) |", "|---|---|---|---|"]
+    for name, row in found["rows"].items():
+        times = " | ".join(f"{row['latency_ms'][part]:.1f}" for part in ("p50", "p99", "worst"))
+        lines.append(f"| {names.get(name, f'`{name}`')} | {times} |")
+    return "\n".join(lines)
+
+
 def soak_text(soak: dict) -> str:
     """Return the held memory at the beginning and the end of the soak test."""
     first, last = soak["held_mb"][0], soak["held_mb"][-1]
@@ -170,6 +187,7 @@ def page(text: str) -> str:
         memory_table(read_json(MEMORY)),
         size_table(read_json(SIZES)),
         updates_table(read_json(UPDATES)),
+        latency_table(read_json(LATENCY)),
         soak_text(read_json(SOAK)),
     )
     before, _, rest = text.partition(START)
