@@ -9,6 +9,7 @@ from dynmap_rl.envs.world import CONTROL_DT
 from dynmap_rl.reporting.figures import plt, save_figure
 from dynmap_rl.utils.files import read_json
 
+from .results import ROWS
 from .tables import join_table
 
 DELAYS = 0, 2, 4, 6, 10, 16, 24, 30  # control steps
@@ -39,8 +40,13 @@ def frame_delay(condition: str, steps: int) -> FrameDelay | None:
 def read_delays(folder: Path) -> list[dict]:
     """Read the results of ``recipes/paper/delays.py``, sorted by task, supervision, policy and condition."""
     results = [read_json(path) for path in sorted(folder.glob("*.json"))]
-    order = list(CONDITIONS)
-    return sorted(results, key=lambda r: (r["task"], r["row"], r["policy"], order.index(r["condition"])))
+    rows, conditions = {row: index for index, row in enumerate(ROWS)}, list(CONDITIONS)
+
+    def place(result: dict) -> tuple:
+        row = rows.get(result["row"], len(rows))  # policies of LeRobot come last
+        return result["task"], row, result["row"], result["policy"], conditions.index(result["condition"])
+
+    return sorted(results, key=place)
 
 
 def delay_table(results: list[dict]) -> str:
@@ -82,58 +88,67 @@ def delay_page(results: list[dict]) -> str:
 
 
 def plot_delays(results: list[dict], path: Path) -> None:
-    """Draw SR against the delay, a panel for each run and a line with its interval for each condition.
+    """Draw SR against the delay, with intervals, and an axis of rates of its own for each panel.
+
+    A task and policy type have a panel with a line for each supervision, rolled forward, and another on stale frames. A run
+    that was measured under further conditions has a panel with a line for each condition.
 
     Args:
         results: see :func:`read_delays`.
         path: file to write.
     """
-    panels: dict[tuple, list[dict]] = {}
-    for result in results:
-        panels.setdefault((result["task"], result["row"], result["policy"]), []).append(result)
-    columns = min(len(panels), 4)
+    panels = _group(results)
+    columns = min(len(panels), 3)
     rows = -(-len(panels) // columns)
-    figure, axes = plt.subplots(
-        rows,
-        columns,
-        figsize=(4.2 * columns, 3 * rows + 1.2),
-        squeeze=False,
-        sharex=True,
-        sharey=True,
-        layout="constrained",
-    )
+    texts = [text for text, *_ in CONDITIONS.values()]
     shades = plt.get_cmap("tab20").colors
-    colors = dict(zip(CONDITIONS, (*shades[::2], shades[1], (0, 0, 0)), strict=True))
+    colors = dict(zip(ROWS, shades[::2], strict=False)) | dict(
+        zip(texts, (*shades[::2], *shades[1::2]), strict=False)
+    )
+    size = 5 * columns, 3.4 * rows
+    figure, axes = plt.subplots(rows, columns, figsize=size, squeeze=False, sharex=True, layout="constrained")
     for axis in axes.flat[len(panels) :]:
         axis.remove()
-    for axis, (name, lines) in zip(axes.flat, panels.items(), strict=False):
-        for result in lines:
-            _draw_line(axis, result, colors[result["condition"]])
-        axis.set_title(", ".join(name), fontsize=8)
+    for axis, (title, lines) in zip(axes.flat, panels.items(), strict=False):
+        for label, result in lines.items():
+            _draw_line(axis, result, label, colors.get(label))
+        axis.set_title(title, fontsize=8)
         axis.set_xlabel("delay of the frames [ms]", fontsize=8)
-        axis.set_ylim(-3, 103)
-        axis.grid(alpha=0.3)
-        axis.tick_params(labelsize=7)
-    for axis in axes[:, 0]:
         axis.set_ylabel("success [%]", fontsize=8)
-    handles = {
-        text: handle
-        for axis in figure.axes
-        for handle, text in zip(*axis.get_legend_handles_labels(), strict=True)
-    }
-    figure.legend(
-        handles.values(), handles, loc="outside lower center", ncols=min(columns + 1, 3), fontsize=7
-    )
+        axis.grid(alpha=0.3)
+        axis.tick_params(labelsize=7, labelbottom=True)
+        axis.legend(fontsize=6)
     save_figure(figure, path)
 
 
-def _draw_line(axis, result: dict, color) -> None:
+def _group(results: list[dict]) -> dict[str, dict[str, dict]]:
+    """Return the results of each panel by their labels: supervisions first, then conditions."""
+    supervisions, conditions = {}, {}
+    for result in results:
+        task, row, policy, condition = (result[name] for name in ("task", "row", "policy", "condition"))
+        conditions.setdefault(f"{task}, {policy}: {row}", {})[CONDITIONS[condition][0]] = result
+        if condition in ("imagined", "stale"):
+            panel = f"{task}, {policy}: {CONDITIONS[condition][0]}"
+            supervisions.setdefault(panel, {})[row] = result
+    further = {
+        panel: lines
+        for panel, lines in conditions.items()
+        if any(result["condition"] not in ("imagined", "stale") for result in lines.values())
+    }
+    return dict(sorted(supervisions.items())) | further
+
+
+def _draw_line(axis, result: dict, label: str, color: str) -> None:
     steps = sorted(map(int, result["cells"]))
     cells = [result["cells"][str(step)] for step in steps]
     time = [1000 * CONTROL_DT * step for step in steps]
     low, high = zip(*(cell["SR_interval"] for cell in cells), strict=True)
-    text, _, _, stale = CONDITIONS[result["condition"]]
-    width = 3 if result["condition"] == "imagined" else 1.4  # others may lie on it
-    style, rates = "--" if stale else "-", [cell["SR"] for cell in cells]
-    axis.plot(time, rates, style, color=color, lw=width, marker=".", label=text)
-    axis.fill_between(time, low, high, color=color, alpha=0.12, lw=0)
+    rates = [cell["SR"] for cell in cells]
+    errors = [
+        [r - x for r, x in zip(rates, low, strict=True)],
+        [x - r for r, x in zip(rates, high, strict=True)],
+    ]
+    style = "--" if CONDITIONS[result["condition"]][3] else "-"
+    axis.errorbar(
+        time, rates, errors, ls=style, color=color, lw=1.4, elinewidth=1, capsize=2, marker=".", label=label
+    )

@@ -27,17 +27,26 @@ def test_the_table_has_a_line_for_each_condition_and_a_column_for_each_delay(tmp
     assert "python imagined" in page and "50 scenes" in page
 
 
-def test_the_figure_has_a_line_for_each_condition(tmp_path, monkeypatch):
+def test_supervisions_share_a_panel_and_a_run_with_further_conditions_has_its_own(tmp_path, monkeypatch):
     saved = []
     monkeypatch.setattr(delays, "save_figure", lambda figure, path: saved.append(figure))
-    delays.plot_delays(make_results(tmp_path), tmp_path / "figure.png")
-    [axis] = saved[0].axes
-    lines = {line.get_label(): line.get_xydata().tolist() for line in axis.get_lines()}
-    assert lines == {
-        "stale frames": [[0, 99], [500, 5], [1500, 0]],
-        "rolled forward": [[0, 99], [500, 95]],
-    }
+    results = make_results(tmp_path)
+    delays.plot_delays(results, tmp_path / "figure.png")
+    jitter = results[1] | {"condition": "jitter"}
+    delays.plot_delays([*results, results[0] | {"row": "Only-RGB"}, jitter], tmp_path / "figure.png")
+    few, many = ([read_lines(axis) for axis in figure.axes] for figure in saved)
+    forward, stale = [[0, 99], [500, 95]], [[0, 99], [500, 5], [1500, 0]]
+    assert few == [{"RGB+[P]": forward}, {"RGB+[P]": stale}]
+    assert sorted(map(sorted, many)) == [
+        ["Only-RGB", "RGB+[P]"],
+        ["RGB+[P]"],
+        ["jitter of 2 steps", "rolled forward", "stale frames"],
+    ]
     plt.close("all")
+
+
+def read_lines(axis):
+    return {bars.get_label(): bars.lines[0].get_xydata().tolist() for bars in axis.containers}
 
 
 @pytest.mark.parametrize("condition", delays.CONDITIONS)
