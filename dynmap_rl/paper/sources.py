@@ -73,6 +73,7 @@ def list_source_cells(
     tasks: tuple[str, ...] = TASKS[:1],
     datasets: Path = Path("datasets/sources"),
     only: Container[str] = tuple(SOURCES),
+    seeds: tuple[int, ...] = WORLD_MODELS,
 ) -> list[Run]:
     """Return the cells of the table, those that train world models first.
 
@@ -80,28 +81,32 @@ def list_source_cells(
         tasks: tasks of the cells. A task that is not in the plane has only the sources without columns of their own.
         datasets: folder of the derived datasets.
         only: sources to list.
+        seeds: seeds of the world models.
     """
     cells = []
     for task in tasks:
         planar = get_task(task).planar
         names = [name for name, s in SOURCES.items() if name in only and (planar or s.columns is None)]
-        cells += [_cell(task, name, seed, datasets) for seed in WORLD_MODELS for name in names]
+        cells += [_cell(task, name, seed, datasets) for seed in seeds for name in names]
     return cells + [_reuse(cell) for cell in cells]
 
 
 def list_data_cells(
-    datasets: Path = Path("datasets/sources"), only: Container[str] = tuple(DATA_ROWS)
+    datasets: Path = Path("datasets/sources"),
+    only: Container[str] = tuple(DATA_ROWS),
+    seeds: tuple[int, ...] = WORLD_MODELS,
 ) -> list[Run]:
     """Return the cells of the amount of data on task 1; those of 300 demonstrations are cells of the table too.
 
     Args:
         datasets: folder of the datasets.
         only: rows to list.
+        seeds: seeds of the world models; the run of end-to-end training has its own.
     """
     cells = []
     for size in SIZES:
         names = [name for name in DATA_ROWS if name in only and name in SOURCES]
-        cells += [_cell(TASKS[0], name, seed, datasets, size) for seed in WORLD_MODELS for name in names]
+        cells += [_cell(TASKS[0], name, seed, datasets, size) for seed in seeds for name in names]
         if "end_to_end" in only:
             dataset = str(dataset_folder(TASKS[0], "simulator", datasets, size))
             arguments = ("--task", TASKS[0], "--dataset", dataset, "--eval.paper_episodes", "0")

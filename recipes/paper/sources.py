@@ -2,6 +2,7 @@
 
     python recipes/paper/sources.py --dry_run
     python recipes/paper/sources.py --only tracks,none,simulator
+    python recipes/paper/sources.py --part table --world_models 0
     python recipes/paper/sources.py --part data
     python recipes/paper/sources.py --write       # table and figures from the results alone
 
@@ -34,6 +35,8 @@ class Config:
     tasks: str = "balance_reaching"
     # Sources with commas between; by default all. --dry_run lists them in the names of the cells.
     only: str = ""
+    # Seeds of the world models, with commas between.
+    world_models: str = "0,1,2"
     # Folder of the cells' results.
     results: Path = RESULTS / "sources"
     # Folder of the cells' runs.
@@ -86,15 +89,18 @@ def main(config: Config) -> None:
 
 def choose_cells(config: Config) -> list:
     """Return the cells of the settings; those that train world models come first."""
-    from dynmap_rl.paper.sources import DATA_ROWS, SOURCES, list_data_cells, list_source_cells
+    from dynmap_rl.paper.sources import DATA_ROWS, SOURCES, WORLD_MODELS, list_data_cells, list_source_cells
 
     only = set(config.only.split(",")) if config.only else {*SOURCES, *DATA_ROWS}
     if unknown := only - {*SOURCES, *DATA_ROWS}:
         names = ",".join(dict.fromkeys([*SOURCES, *DATA_ROWS]))
         raise ValueError(f"--only must be any of {names}, got {','.join(sorted(unknown))}")
-    tasks = tuple(config.tasks.split(","))
-    cells = list_source_cells(tasks, config.datasets, only) if config.part != "data" else []
-    cells += list_data_cells(config.datasets, only) if config.part != "table" else []
+    given = config.world_models.split(",")
+    if not set(given) <= {*map(str, WORLD_MODELS)}:
+        raise ValueError(f"--world_models must be any of 0,1,2, got {config.world_models}")
+    tasks, seeds = tuple(config.tasks.split(",")), tuple(map(int, given))
+    cells = list_source_cells(tasks, config.datasets, only, seeds) if config.part != "data" else []
+    cells += list_data_cells(config.datasets, only, seeds) if config.part != "table" else []
     unique = {cell.name: cell for cell in cells}
     return sorted(unique.values(), key=lambda cell: cell.needs is not None)
 

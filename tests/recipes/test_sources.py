@@ -59,6 +59,8 @@ def test_every_source_has_three_world_models_and_two_policies(tmp_path):
     assert {name for name in names if "_tracks_" in name} == set(
         listed(tmp_path, "--part", "table", "--only", "tracks")[0]
     )
+    first, _ = listed(tmp_path, "--world_models", "0", "--part", "table")
+    assert set(first) == {name for name in names if "_world_model_0_" in name}
 
 
 def test_cells_run_once_and_make_a_page(calls, tmp_path):
@@ -84,13 +86,11 @@ def test_cells_run_once_and_make_a_page(calls, tmp_path):
 
 
 @pytest.mark.slow
-def test_real_cells(recordings, tmp_path, monkeypatch):
+def test_real_cells(recordings, tmp_path):
     """A source of columns of its own, with fewer entries than the task has, trains, is evaluated and measured."""
     commands.place_recordings(tmp_path, recordings, TASK)
-    monkeypatch.setattr("dynmap_rl.paper.sources.WORLD_MODELS", (0,))
-    result = run(
-        tmp_path, "--part", "table", "--only", "command,tracks,labelled_50,informed", "--workers", "2"
-    )
+    only = "--world_models", "0", "--only", "command,tracks,labelled_50,informed"
+    result = run(tmp_path, "--part", "table", *only, "--workers", "2")
     assert result.returncode == 0, result.stderr
     results = {p.stem: read_json(p) for p in (tmp_path / "results").glob("*.json")}
     assert len(results) == 8 and all(r["test_protocol"]["episodes"] == 3 for r in results.values())
@@ -107,6 +107,7 @@ def test_real_cells(recordings, tmp_path, monkeypatch):
     [
         (["--only", "radar"], "'radar'|radar"),
         (["--part", "half"], "'half'"),
+        (["--world_models", "0,3"], "0,3"),
         (["--write"], "results must have results"),
         (["--tasks", "nothing", "--dry_run"], "nothing"),
         (["--workers", "0"], "workers"),
