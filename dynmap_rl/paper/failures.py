@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from dynmap_rl.evaluation.failures import CAUSES, failure_causes
@@ -14,39 +15,48 @@ from dynmap_rl.utils.files import read_json
 from .cells import TASKS
 from .tables import join_table
 
-RUNS = [  # runs whose failures are shown
-    f"{TASKS[0]}_decoupled_none_feedforward",
-    f"{TASKS[0]}_decoupled_none_recurrent",
-    f"{TASKS[0]}_decoupled_position_velocity_feedforward",
-    *(f"{task}_decoupled_position_velocity_recurrent" for task in TASKS),
+_DECOUPLED = [
+    *(f"{task}_decoupled_{some}_recurrent" for task in TASKS for some in ("none", "position_velocity")),
+    *(f"{TASKS[0]}_decoupled_{some}_feedforward" for some in ("none", "position_velocity")),
+]
+_OTHERS = [
+    f"{TASKS[0]}_plain_none_recurrent",
     f"{TASKS[0]}_joint_position_velocity_recurrent",
     f"{TASKS[0]}_end_to_end_recurrent",
+]
+CELLS = [  # cells whose failures are shown, each with the names of its runs
+    *([name, *(f"{name}_world_model_{seed}" for seed in (1, 2))] for name in _DECOUPLED),
+    *([name] for name in _OTHERS),
 ]
 REPEATED = "succeeds when repeated"  # frames in other batches differ in their last bits
 
 
-def find_failures(run: Path) -> dict:
-    """Run the failed episodes of a run's first policy again, and find their causes.
+def find_failures(runs: Sequence[Path]) -> dict:
+    """Run the failed episodes of a cell again, those of each run's first policy, and find their causes.
 
     Args:
-        run: folder of a complete run.
+        runs: folders of complete runs of the cell.
 
     Returns:
-        ``task``, ``row``, ``policy``, number of ``episodes``, and ``scenes``, the scene seeds by cause.
+        ``task``, ``row``, ``policy``, ``training``, names of the ``runs``, number of ``episodes``, and ``scenes``, the
+        scene seeds by cause.
     """
-    result = read_json(run / "eval.json")
-    rows = result_rows(result)[0]
-    seeds, scenes = [row["scene_seed"] for row in rows if not row["success"]], {}
-    if seeds:
-        episodes = roll_out(load_actor(run, result["seeds"][0]), result["task"], seeds)
-        for seed, cause in zip(seeds, failure_causes(episodes, result["task"]), strict=True):
-            scenes.setdefault(cause or REPEATED, []).append(seed)
+    episodes, scenes = 0, {}
+    for run in runs:
+        result = read_json(run / "eval.json")
+        rows = result_rows(result)[0]
+        episodes += len(rows)
+        if seeds := [row["scene_seed"] for row in rows if not row["success"]]:
+            again = roll_out(load_actor(run, result["seeds"][0]), result["task"], seeds)
+            for seed, cause in zip(seeds, failure_causes(again, result["task"]), strict=True):
+                scenes.setdefault(cause or REPEATED, []).append(seed)
     facts = {name: result[name] for name in ("task", "row", "policy")}
-    return facts | {"training": result["world_model"]["training"], "episodes": len(rows), "scenes": scenes}
+    facts |= {"training": result["world_model"]["training"], "runs": [run.name for run in runs]}
+    return facts | {"episodes": episodes, "scenes": scenes}
 
 
 def plot_failures(failures: list[dict], path: Path) -> None:
-    """Draw a bar for each run, the share of failed episodes (%) by cause.
+    """Draw a bar for each cell, the share of failed episodes (%) by cause.
 
     Args:
         failures: results of :func:`find_failures`.

@@ -5,7 +5,7 @@
 
 Fig. 2 to 4 show demonstrations, Fig. 6 and 9 predictions of a world model of task 1 on tasks 1 and 3, Fig. 7 policy
 losses, Fig. 8 closed-loop episodes; Fig. 1 and 5 of the paper are diagrams. The figure distributions shows angles and
-angular velocities in the demonstrations, failures the failed episodes of some runs by cause; both come with JSON. The page
+angular velocities in the demonstrations, failures the failed episodes of some cells by cause; both come with JSON. The page
 report.html shows all figures.
 """
 
@@ -170,13 +170,14 @@ def draw_fig8(config: Config, datasets: dict) -> None:
 
 
 def draw_failures(config: Config, datasets: dict) -> None:
-    """Draw the failures of some runs by cause, and write them as JSON."""
-    from dynmap_rl.paper.failures import RUNS, find_failures, plot_failures
+    """Draw the failures of some cells by cause, and write them as JSON."""
+    from dynmap_rl.paper.failures import CELLS, find_failures, plot_failures
     from dynmap_rl.utils.files import write_json
     from dynmap_rl.utils.version import find_commit
 
-    missing = find_missing(config.runs, RUNS)
-    failures = [find_failures(config.runs / name) for name in RUNS if name not in missing]
+    missing = find_missing(config.runs, [name for names in CELLS for name in names])
+    cells = [[config.runs / name for name in names if name not in missing] for names in CELLS]
+    failures = [find_failures(runs) for runs in cells if runs]
     plot_failures(failures, config.output / "failures.png")
     facts = {"command": command_line(sys.argv), "commit": find_commit(), "failures": failures}
     write_json(config.output / "failures.json", facts)

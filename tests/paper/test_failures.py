@@ -10,7 +10,7 @@ from dynmap_rl.evaluation.rollout import scene_seeds
 from dynmap_rl.modules.checkpoints import make_policy, make_world_model, save_policy, save_world_model
 from dynmap_rl.paper import failures
 from dynmap_rl.paper.cells import list_runs
-from dynmap_rl.paper.failures import REPEATED, RUNS, find_failures, markdown_failures, plot_failures
+from dynmap_rl.paper.failures import CELLS, REPEATED, find_failures, markdown_failures, plot_failures
 from dynmap_rl.utils.files import write_json
 
 ONE = {
@@ -28,7 +28,7 @@ FAILURES = [
 
 
 def test_the_runs_are_those_of_the_grid():
-    assert set(RUNS) <= {run.name for run in list_runs()}
+    assert {name for names in CELLS for name in names} <= {run.name for run in list_runs()}
 
 
 def test_failed_episodes_alone_are_run_again(recording, tmp_path):
@@ -43,10 +43,15 @@ def test_failed_episodes_alone_are_run_again(recording, tmp_path):
     facts = {"task": "balance_reaching", "row": "RGB+[P]", "policy": "feedforward", "seeds": [1]}
     source = {"task": "balance_reaching", "training": "decoupled"}
     write_json(tmp_path / "eval.json", facts | {"world_model": source, "results": [{"test": {"rows": rows}}]})
-    found = find_failures(tmp_path)
+    found = find_failures([tmp_path])
     assert found["episodes"] == 3 and found["training"] == "decoupled"
+    assert found["runs"] == [tmp_path.name]
     assert sorted(seed for seeds in found["scenes"].values() for seed in seeds) == [first + 1, first + 2]
     assert set(found["scenes"]) <= {*CAUSES, REPEATED}
+    twice = find_failures([tmp_path, tmp_path])
+    assert twice["episodes"] == 6 and all(
+        len(twice["scenes"][c]) == 2 * len(s) for c, s in found["scenes"].items()
+    )
 
 
 def test_a_row_has_the_shares_of_its_causes():
