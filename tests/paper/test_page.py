@@ -43,6 +43,13 @@ def test_everything_is_described():
         assert (RESULTS / path).exists(), path
 
 
+def test_a_cell_trained_again_is_the_same():
+    again = read_json(RESULTS / "measurements/retrained_position_recurrent.json")
+    cell = read_json(RESULTS / "cells/balance_reaching_decoupled_position_recurrent.json")
+    assert again["world_model_sha256"] == cell["world_model_sha256"] and again["commit"] != cell["commit"]
+    assert result_rows(again) == result_rows(cell)
+
+
 def test_stored_intervals_are_those_of_the_episodes():
     for path in sorted((RESULTS / "cells").glob("*.json"))[::6]:
         result = read_json(path)
