@@ -10,7 +10,7 @@ old; ``onnx`` is ``actor`` in onnxruntime. ``--lerobot`` names policies of LeRob
 which they predict a chunk. ``server`` is a policy in a process of its own, which works on every frame for
 about ``--work`` seconds of its processor (it encodes the frame again and again), and answers with a chunk; the loop goes
 on meanwhile, and its latency is the time to look up the action. It cannot be ``--fast``, as a frame would then be older
-in steps. Loop and server share one core. Writes ``recipes/results/measurements/realtime.json``.
+in steps. Loop and server share one core. Rows of the paced loop have names that end in ``_paced``. Writes ``recipes/results/measurements/realtime.json``.
 """
 
 from __future__ import annotations
@@ -216,7 +216,7 @@ def main() -> None:
                 row["age_steps"] = {"p50": p50, "p99": p99, "worst": max(controller.ages)}
                 row |= {"steps_without_action": controller.empty, "work_s": options.work}
             found = read_json(options.output) if options.output.exists() else {"rows": {}}
-            found["rows"][name] = row
+            found["rows"][f"{name}_paced" if row["paced"] else name] = row
             found |= {
                 "command": command_line(sys.argv),
                 "commit": find_commit(),

@@ -164,11 +164,17 @@ def latency_table(found: dict) -> str:
         "delayed": "the same on frames 300 ms old, rolled forward",
         "act": "ACT, chunks of 20, a new one after 10 steps",
         "diffusion": "Diffusion Policy, 10 DDIM steps, a new chunk after 8 steps",
+        "server": "actions of a policy in another process, which works 200 ms on a frame",
     }
-    lines = ["| control step on one core | p50 (ms) | p99 (ms) | worst (ms) |", "|---|---|---|---|"]
+    lines = [
+        "| control step on one core | loop | p50 (ms) | p99 (ms) | worst (ms) | SR |",
+        "|---|---|---|---|---|---|",
+    ]
     for name, row in found["rows"].items():
+        loop, text = "20 Hz" if row["paced"] else "fast", name.removesuffix("_paced")
         times = " | ".join(f"{row['latency_ms'][part]:.1f}" for part in ("p50", "p99", "worst"))
-        lines.append(f"| {names.get(name, f'`{name}`')} | {times} |")
+        success = "" if text in ("act", "diffusion") else f"{row['SR']:.0f} % of {row['episodes']}"
+        lines.append(f"| {names.get(text, f'`{text}`')} | {loop} | {times} | {success} |")
     return "\n".join(lines)
 
 
