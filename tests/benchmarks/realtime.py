@@ -216,12 +216,9 @@ def main() -> None:
                 row["age_steps"] = {"p50": p50, "p99": p99, "worst": max(controller.ages)}
                 row |= {"steps_without_action": controller.empty, "work_s": options.work}
             found = read_json(options.output) if options.output.exists() else {"rows": {}}
+            row |= {"command": command_line(sys.argv), "commit": find_commit()}
             found["rows"][f"{name}_paced" if row["paced"] else name] = row
-            found |= {
-                "command": command_line(sys.argv),
-                "commit": find_commit(),
-                "machine": platform.platform(),
-            }
+            found["machine"] = platform.platform()
             write_json(options.output, found)
             print(name, row, flush=True)
 
