@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from dynmap_rl.envs.delay import FrameDelay
@@ -53,7 +54,7 @@ def delay_table(results: list[dict]) -> str:
     """Return SR (%) with 95 % Wilson intervals as a table in Markdown: a line for each run and condition."""
     delays = sorted({int(steps) for result in results for steps in result["cells"]})
     header = ["task", "world model", "policy", "condition"]
-    header += [f"{round(1000 * CONTROL_DT * steps)} ms" for steps in delays]
+    header += [f"{_milliseconds(steps)} ms" for steps in delays]
     lines = []
     for result in results:
         cells = [result["cells"].get(str(steps)) for steps in delays]
@@ -61,8 +62,7 @@ def delay_table(results: list[dict]) -> str:
             f"**{c['SR']:.1f}** [{c['SR_interval'][0]:.1f}, {c['SR_interval'][1]:.1f}]" if c else ""
             for c in cells
         ]
-        text = CONDITIONS[result["condition"]][0]
-        lines.append([result["task"], result["row"], result["policy"], text, *values])
+        lines.append([result["task"], result["row"], result["policy"], condition_text(result), *values])
     return join_table(header, lines)
 
 
@@ -88,67 +88,112 @@ def delay_page(results: list[dict]) -> str:
 
 
 def plot_delays(results: list[dict], path: Path) -> None:
-    """Draw SR against the delay, with intervals, and an axis of rates of its own for each panel.
+    """Draw success with its intervals: lines against the delay, and dots for what was measured at a few delays.
 
-    A task and policy type have a panel with a line for each supervision, rolled forward, and another on stale frames. A run
-    that was measured under further conditions has a panel with a line for each condition.
+    Results with more than two delays are lines in the first panel. The other panels have a line of dots for each: the
+    supervisions of every task, rolled forward, at each delay, and the conditions at their delay. A panel without results
+    is left out.
 
     Args:
         results: see :func:`read_delays`.
         path: file to write.
     """
-    panels = _group(results)
-    columns = min(len(panels), 3)
-    rows = -(-len(panels) // columns)
-    texts = [text for text, *_ in CONDITIONS.values()]
-    shades = plt.get_cmap("tab20").colors
-    colors = dict(zip(ROWS, shades[::2], strict=False)) | dict(
-        zip(texts, (*shades[::2], *shades[1::2]), strict=False)
-    )
-    size = 5 * columns, 3.4 * rows
-    figure, axes = plt.subplots(rows, columns, figsize=size, squeeze=False, sharex=True, layout="constrained")
-    for axis in axes.flat[len(panels) :]:
+    lines = {_text(r): r for r in results if len(r["cells"]) > 2}
+    panels = [(title, dots) for title, dots in _dots(results).items() if len(dots) > 1]
+    count = bool(lines) + len(panels)
+    columns = min(count, 3) or 1
+    rows = -(-count // columns) or 1
+    size = 5.4 * columns, 3.6 * rows
+    figure, axes = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
+    for axis in axes.flat[count:]:
         axis.remove()
-    for axis, (title, lines) in zip(axes.flat, panels.items(), strict=False):
-        for label, result in lines.items():
-            _draw_line(axis, result, label, colors.get(label))
-        axis.set_title(title, fontsize=8)
-        axis.set_xlabel("delay of the frames [ms]", fontsize=8)
-        axis.set_ylabel("success [%]", fontsize=8)
+    if lines:
+        _draw_lines(axes.flat[0], lines)
+    for axis, (title, dots) in zip(axes.flat[bool(lines) :], panels, strict=False):
+        _draw_dots(axis, title, dots)
+    for axis in axes.flat[:count]:
         axis.grid(alpha=0.3)
-        axis.tick_params(labelsize=7, labelbottom=True)
-        axis.legend(fontsize=6)
+        axis.tick_params(labelsize=7)
     save_figure(figure, path)
 
 
-def _group(results: list[dict]) -> dict[str, dict[str, dict]]:
-    """Return the results of each panel by their labels: supervisions first, then conditions."""
-    supervisions, conditions = {}, {}
+def condition_text(result: dict) -> str:
+    """Return what was done about the delay; a policy of LeRobot bridges it by its chunks."""
+    chunks = {"stale": "chunks from their first action", "imagined": "chunks from the present step"}
+    if result["policy"] == "LeRobot" and result["condition"] in chunks:
+        return chunks[result["condition"]]
+    return CONDITIONS[result["condition"]][0]
+
+
+def _text(result: dict) -> str:
+    row = result["row"].upper() if result["policy"] == "LeRobot" else f"{result['row']}, {result['policy']}"
+    task = "" if result["task"] == "balance_reaching" else f"{result['task']}, "
+    return f"{task}{row}: {condition_text(result)}"
+
+
+def _milliseconds(steps: int | str) -> int:
+    return round(1000 * CONTROL_DT * int(steps))
+
+
+def _dots(results: list[dict]) -> dict[str, dict[str, dict[str, dict]]]:
+    """Return the cells of each panel of dots, by their line and their marker."""
+    panels = {}
     for result in results:
-        task, row, policy, condition = (result[name] for name in ("task", "row", "policy", "condition"))
-        conditions.setdefault(f"{task}, {policy}: {row}", {})[CONDITIONS[condition][0]] = result
-        if condition in ("imagined", "stale"):
-            panel = f"{task}, {policy}: {CONDITIONS[condition][0]}"
-            supervisions.setdefault(panel, {})[row] = result
-    further = {
-        panel: lines
-        for panel, lines in conditions.items()
-        if any(result["condition"] not in ("imagined", "stale") for result in lines.values())
-    }
-    return dict(sorted(supervisions.items())) | further
+        task, policy, condition = (result[name] for name in ("task", "policy", "condition"))
+        if policy == "LeRobot" or condition == "past_actions":
+            continue
+        for steps, cell in sorted(result["cells"].items(), key=lambda item: int(item[0])):
+            at = f"{_milliseconds(steps)} ms"
+            if condition == "imagined" and int(steps):
+                panel = panels.setdefault(f"{task}, rolled forward, {at}", {})
+                panel.setdefault(result["row"], {})[policy] = cell
+            if len(result["cells"]) < 3 and condition != "imagined":
+                panel = panels.setdefault(f"{task}, {result['row']}, {policy}: conditions", {})
+                panel.setdefault(condition_text(result), {})[at] = cell
+    return panels
 
 
-def _draw_line(axis, result: dict, label: str, color: str) -> None:
-    steps = sorted(map(int, result["cells"]))
-    cells = [result["cells"][str(step)] for step in steps]
-    time = [1000 * CONTROL_DT * step for step in steps]
-    low, high = zip(*(cell["SR_interval"] for cell in cells), strict=True)
-    rates = [cell["SR"] for cell in cells]
-    errors = [
-        [r - x for r, x in zip(rates, low, strict=True)],
-        [x - r for r, x in zip(rates, high, strict=True)],
-    ]
-    style = "--" if CONDITIONS[result["condition"]][3] else "-"
-    axis.errorbar(
-        time, rates, errors, ls=style, color=color, lw=1.4, elinewidth=1, capsize=2, marker=".", label=label
-    )
+def _draw_lines(axis, lines: dict[str, dict]) -> None:
+    for label, result in lines.items():
+        steps = sorted(map(int, result["cells"]))
+        cells = [result["cells"][str(step)] for step in steps]
+        rates, errors = [cell["SR"] for cell in cells], _errors(cells)
+        style = "--" if CONDITIONS[result["condition"]][3] else "-"
+        time = [_milliseconds(step) for step in steps]
+        axis.errorbar(time, rates, errors, ls=style, lw=1.4, elinewidth=1, capsize=2, marker=".", label=label)
+    axis.set_title("success against the delay of the frames", fontsize=8)
+    axis.set_xlabel("delay of the frames [ms]", fontsize=8)
+    axis.set_ylabel("success [%]", fontsize=8)
+    axis.legend(fontsize=6)
+
+
+def _draw_dots(axis, title: str, dots: dict[str, dict[str, dict]]) -> None:
+    names, markers = list(dots), sorted({name for cells in dots.values() for name in cells})
+    for marker, (index, label) in zip("os^Dv", enumerate(markers), strict=False):
+        shift = 0.15 * (index - (len(markers) - 1) / 2)
+        found = [(place + shift, cells[label]) for place, cells in enumerate(dots.values()) if label in cells]
+        places, cells = zip(*found, strict=True)
+        rates, color = [cell["SR"] for cell in cells], "C1" if label == "recurrent" else f"C{index}"
+        axis.errorbar(
+            rates,
+            places,
+            xerr=_errors(cells),
+            ls="",
+            color=color,
+            marker=marker,
+            ms=4,
+            capsize=2,
+            label=label,
+        )
+    axis.set_yticks(range(len(names)), names)
+    axis.invert_yaxis()
+    axis.set_title(title, fontsize=8)
+    axis.set_xlabel("success [%]", fontsize=8)
+    axis.legend(fontsize=6)
+
+
+def _errors(cells: Sequence[dict]) -> list[list[float]]:
+    """Return how far the intervals reach below and above the rates."""
+    rates, (low, high) = [cell["SR"] for cell in cells], zip(*(c["SR_interval"] for c in cells), strict=True)
+    below = [rate - end for rate, end in zip(rates, low, strict=True)]
+    return [below, [end - rate for rate, end in zip(rates, high, strict=True)]]

@@ -27,21 +27,31 @@ def test_the_table_has_a_line_for_each_condition_and_a_column_for_each_delay(tmp
     assert "python imagined" in page and "50 scenes" in page
 
 
-def test_supervisions_share_a_panel_and_a_run_with_further_conditions_has_its_own(tmp_path, monkeypatch):
+def test_long_results_are_lines_and_others_are_dots_of_supervisions_and_conditions(tmp_path, monkeypatch):
     saved = []
     monkeypatch.setattr(delays, "save_figure", lambda figure, path: saved.append(figure))
-    results = make_results(tmp_path)
-    delays.plot_delays(results, tmp_path / "figure.png")
-    jitter = results[1] | {"condition": "jitter"}
-    delays.plot_delays([*results, results[0] | {"row": "Only-RGB"}, jitter], tmp_path / "figure.png")
-    few, many = ([read_lines(axis) for axis in figure.axes] for figure in saved)
-    forward, stale = [[0, 99], [500, 95]], [[0, 99], [500, 5], [1500, 0]]
-    assert few == [{"RGB+[P]": forward}, {"RGB+[P]": stale}]
-    assert sorted(map(sorted, many)) == [
-        ["Only-RGB", "RGB+[P]"],
-        ["RGB+[P]"],
-        ["jitter of 2 steps", "rolled forward", "stale frames"],
-    ]
+    stale, imagined = make_results(tmp_path)
+    other, jitter = imagined | {"row": "Only-RGB"}, imagined | {"condition": "jitter"}
+    act = imagined | {"row": "act", "policy": "LeRobot", "cells": stale["cells"]}
+    delays.plot_delays([stale, imagined, other, jitter, act], tmp_path / "figure.png")
+    lines, supervisions = saved[0].axes
+    assert read_lines(lines) == {
+        "RGB+[P], recurrent: stale frames": [[0, 99], [500, 5], [1500, 0]],
+        "ACT: chunks from the present step": [[0, 99], [500, 5], [1500, 0]],
+    }
+    assert read_lines(supervisions) == {"recurrent": [[95, 0], [95, 1]]}
+    assert [label.get_text() for label in supervisions.get_yticklabels()] == ["RGB+[P]", "Only-RGB"]
+    plt.close("all")
+
+
+def test_conditions_of_a_run_share_a_panel(tmp_path, monkeypatch):
+    saved = []
+    monkeypatch.setattr(delays, "save_figure", lambda figure, path: saved.append(figure))
+    _, imagined = make_results(tmp_path)
+    jitter, lost = (imagined | {"condition": name} for name in ("jitter", "lost_10"))
+    delays.plot_delays([imagined, jitter, lost], tmp_path / "figure.png")
+    (panel,) = saved[0].axes
+    assert read_lines(panel) == {"0 ms": [[99, -0.075], [99, 0.925]], "500 ms": [[95, 0.075], [95, 1.075]]}
     plt.close("all")
 
 
