@@ -17,8 +17,8 @@ SEEDS = 0, 1, 2  # of the world models
 MINUTES = {  # of one of two busy cores
     "decoupled": 25,
     "reuse": 8,
-    "joint": 30,
-    "end_to_end": 30,
+    "joint": 75,
+    "end_to_end": 60,
     "generalize": 13,
     "baseline": 60,
 }
