@@ -152,7 +152,7 @@ def markdown_perception(probe: dict) -> str:
 
 
 def markdown_runs(results: Path) -> str:
-    """Return a table of the decoupled cells of RGB+[P+V] and Only-RGB that have a run, and of the careless baseline.
+    """Return a table of the decoupled cells of RGB+[P+V] and Only-RGB that have a run, and of the baselines.
 
     Args:
         results: see :func:`markdown_page`.
@@ -161,23 +161,32 @@ def markdown_runs(results: Path) -> str:
     for (task, training, policy, row), cell in read_cells(results / "cells", TABLES[:4]).items():
         if training != "decoupled" or row.split(",")[0] not in MAIN or not cell.results:
             continue
-        summary, reported = cell.summary, METRICS[task]
-        low, high = summary["SR_interval"]
-        others = (f"{summary[name]:.1f}" if name in reported else "" for name in UNITS)
-        rate = f"**{summary['SR']:.1f}** [{low:.1f}, {high:.1f}]"
-        count = str(len(summary["world_models"]))
-        lines.append([task, f"{row}, {policy}", count, f"{summary['episodes']:,}", *others, rate])
+        count = str(len(cell.summary["world_models"]))
+        lines.append([task, f"{row}, {policy}", count, *_rates(cell.summary, task)])
     for path in sorted((results / "measurements").glob("careless_*.json")):
         run = read_json(path)
         rates, count = run["rates"], f"{run['episodes']:,}"
         lines.append([
             run["task"], "careless", "", count, f"{rates['dropped']:.1f}", "", f"{rates['success']:.1f}",
         ])  # fmt: skip
+    for path in sorted((results / "measurements").glob("*.json")):
+        run = read_json(path)
+        if run.get("policy") == "LeRobot":
+            lines.append(
+                [run["task"], f"{run['row']} of LeRobot", "", *_rates(run["test_protocol"], run["task"])]
+            )
     lines.sort(key=lambda line: TASKS.index(line[0]))
     rows = [[str(1 + TASKS.index(task)), *line] for task, *line in lines]
     return join_table(
         ["task", "world model, policy", "world models", "episodes", "DR %", "PE mm", "SR %"], rows
     )
+
+
+def _rates(summary: dict, task: str) -> list[str]:
+    """Return number of episodes, DR, PE and SR with its interval; a metric that the task does not have is empty."""
+    low, high = summary["SR_interval"]
+    others = (f"{summary[name]:.1f}" if name in METRICS[task] else "" for name in UNITS)
+    return [f"{summary['episodes']:,}", *others, f"**{summary['SR']:.1f}** [{low:.1f}, {high:.1f}]"]
 
 
 def replace_block(text: str, block: str) -> str:
