@@ -72,7 +72,7 @@ def test_perception_is_a_row_for_each_model_and_dataset():
     assert len(lines) == 4 and all(line.endswith("| 12.0 mm |  |") for line in lines[1:])
 
 
-def test_main_cells_and_the_careless_baseline_are_rows(tmp_path, monkeypatch):
+def test_main_cells_and_baselines_are_rows(tmp_path, monkeypatch):
     summary = {"episodes": 3000, "DR": 1.0, "PE": 12.34, "SR": 97.0, "SR_interval": [96.0, 98.0]}
     done = SimpleNamespace(results=[{}], summary=summary | {"world_models": [97.0]})
     cells = {
@@ -86,10 +86,13 @@ def test_main_cells_and_the_careless_baseline_are_rows(tmp_path, monkeypatch):
     rates = {"task": "balance_reaching", "rates": {"dropped": 90.6, "success": 9.4}, "episodes": 1000}
     (tmp_path / "measurements").mkdir()
     (tmp_path / "measurements/careless_x.json").write_text(json.dumps(rates))
+    act = {"policy": "LeRobot", "row": "ACT", "task": "bin_dropping", "test_protocol": summary}
+    (tmp_path / "measurements/act_x.json").write_text(json.dumps(act))
     assert markdown_runs(tmp_path).splitlines()[2:] == [
         "| 1 | RGB+[P+V], plain CNN, recurrent | 1 | 3,000 | 1.0 | 12.3 | **97.0** [96.0, 98.0] |",
         "| 1 | careless |  | 1,000 | 90.6 |  | 9.4 |",
         "| 3 | Only-RGB, recurrent | 1 | 3,000 |  |  | **97.0** [96.0, 98.0] |",
+        "| 3 | ACT of LeRobot |  | 3,000 |  |  | **97.0** [96.0, 98.0] |",
     ]
 
 
