@@ -74,6 +74,7 @@ def list_source_cells(
     datasets: Path = Path("datasets/sources"),
     only: Container[str] = tuple(SOURCES),
     seeds: tuple[int, ...] = WORLD_MODELS,
+    architecture: str = "glimpse",
 ) -> list[Run]:
     """Return the cells of the table, those that train world models first.
 
@@ -82,12 +83,13 @@ def list_source_cells(
         datasets: folder of the derived datasets.
         only: sources to list.
         seeds: seeds of the world models.
+        architecture: form of the world models; cells of another form have the same names and need other folders.
     """
     cells = []
     for task in tasks:
         planar = get_task(task).planar
         names = [name for name, s in SOURCES.items() if name in only and (planar or s.columns is None)]
-        cells += [_cell(task, name, seed, datasets) for seed in seeds for name in names]
+        cells += [_cell(task, name, seed, datasets, 300, architecture) for seed in seeds for name in names]
     return cells + [_reuse(cell) for cell in cells]
 
 
@@ -95,6 +97,7 @@ def list_data_cells(
     datasets: Path = Path("datasets/sources"),
     only: Container[str] = tuple(DATA_ROWS),
     seeds: tuple[int, ...] = WORLD_MODELS,
+    architecture: str = "glimpse",
 ) -> list[Run]:
     """Return the cells of the amount of data on task 1; those of 300 demonstrations are cells of the table too.
 
@@ -102,12 +105,15 @@ def list_data_cells(
         datasets: folder of the datasets.
         only: rows to list.
         seeds: seeds of the world models; the run of end-to-end training has its own.
+        architecture: form of the world models; end-to-end training has none but the default.
     """
     cells = []
     for size in SIZES:
         names = [name for name in DATA_ROWS if name in only and name in SOURCES]
-        cells += [_cell(TASKS[0], name, seed, datasets, size) for seed in seeds for name in names]
-        if "end_to_end" in only:
+        cells += [
+            _cell(TASKS[0], name, seed, datasets, size, architecture) for seed in seeds for name in names
+        ]
+        if "end_to_end" in only and architecture == "glimpse":
             dataset = str(dataset_folder(TASKS[0], "simulator", datasets, size))
             arguments = ("--task", TASKS[0], "--dataset", dataset, "--eval.paper_episodes", "0")
             name = cell_name(TASKS[0], "end_to_end", 0, "recurrent", size)
@@ -159,7 +165,9 @@ def make_datasets(cells: list[Run], datasets: Path, workers: int = 1) -> None:
                     write_json(folder.with_name(f"{folder.name}.quality.json"), quality)
 
 
-def _cell(task: str, name: str, seed: int, datasets: Path, size: int = 300) -> Run:
+def _cell(
+    task: str, name: str, seed: int, datasets: Path, size: int = 300, architecture: str = "glimpse"
+) -> Run:
     """Return the cell that trains a world model and recurrent policies."""
     source = SOURCES[name]
     arguments = (
@@ -167,6 +175,7 @@ def _cell(task: str, name: str, seed: int, datasets: Path, size: int = 300) -> R
         "--world_model.supervision", source.supervision, "--eval.paper_episodes", "0",
         "--world_model.seed", str(seed), *source.options,
     )  # fmt: skip
+    arguments += () if architecture == "glimpse" else ("--world_model.architecture", architecture)
     cell = task, "decoupled", "recurrent", source.text
     return Run(cell_name(task, name, seed, "recurrent", size), "decoupled", cell, arguments, table="sources")
 

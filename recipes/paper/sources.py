@@ -4,6 +4,7 @@
     python recipes/paper/sources.py --only tracks,none,simulator
     python recipes/paper/sources.py --part table --world_models 0
     python recipes/paper/sources.py --part data
+    python recipes/paper/sources.py --part table --architecture plain   # the paper's CNN, for which dynamics decide
     python recipes/paper/sources.py --write       # table and figures from the results alone
 
 The table has a world model for each source of dynamics and seed, with recurrent and feed-forward policies (see
@@ -14,7 +15,7 @@ README.md with the tables and the rank correlation of the measures with success,
 """
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -37,10 +38,12 @@ class Config:
     only: str = ""
     # Seeds of the world models, with commas between.
     world_models: str = "0,1,2"
-    # Folder of the cells' results.
-    results: Path = RESULTS / "sources"
-    # Folder of the cells' runs.
-    runs: Path = Path("runs/sources")
+    # Form of the world models: glimpse, or plain, the paper's CNN.
+    architecture: str = "glimpse"
+    # Folder of the cells' results; by default recipes/results/sources, or sources_plain.
+    results: Path | None = None
+    # Folder of the cells' runs; by default runs/sources, or runs/sources_plain.
+    runs: Path | None = None
     # Folder of the derived datasets.
     datasets: Path = Path("datasets/sources")
     # Cells at a time; each takes two cores if it is alone, otherwise one.
@@ -56,6 +59,7 @@ class Config:
 
     def __post_init__(self):
         check_choice(self, "part", ("table", "data", "all"))
+        check_choice(self, "architecture", ("glimpse", "plain"))
         check_at_least(self, 1, "workers", "probe_episodes")
         if self.presets and not self.presets.is_dir():
             raise ValueError(f"--presets must be a folder, got {self.presets}")
@@ -63,6 +67,10 @@ class Config:
 
 def main(config: Config) -> None:
     """Run the cells without a result, measure, and write."""
+    name = "sources" if config.architecture == "glimpse" else f"sources_{config.architecture}"
+    config = replace(
+        config, results=config.results or RESULTS / name, runs=config.runs or Path("runs") / name
+    )
     from dynmap_rl.paper.launch import execute, has_run, is_done, launch, print_runs
     from dynmap_rl.paper.sources import make_datasets
 
@@ -99,8 +107,9 @@ def choose_cells(config: Config) -> list:
     if not set(given) <= {*map(str, WORLD_MODELS)}:
         raise ValueError(f"--world_models must be any of 0,1,2, got {config.world_models}")
     tasks, seeds = tuple(config.tasks.split(",")), tuple(map(int, given))
-    cells = list_source_cells(tasks, config.datasets, only, seeds) if config.part != "data" else []
-    cells += list_data_cells(config.datasets, only, seeds) if config.part != "table" else []
+    form, cells = config.architecture, []
+    cells += list_source_cells(tasks, config.datasets, only, seeds, form) if config.part != "data" else []
+    cells += list_data_cells(config.datasets, only, seeds, form) if config.part != "table" else []
     unique = {cell.name: cell for cell in cells}
     return sorted(unique.values(), key=lambda cell: cell.needs is not None)
 

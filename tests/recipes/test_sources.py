@@ -85,6 +85,19 @@ def test_cells_run_once_and_make_a_page(calls, tmp_path):
     assert len(calls) == 1
 
 
+def test_cells_of_the_plain_architecture_differ_in_the_training_of_their_world_models_alone(calls, tmp_path):
+    only = "--part", "table", "--only", "tracks", "--world_models", "0"
+    for form in ("glimpse", "plain"):
+        assert run(tmp_path, *only, "--architecture", form, "--runs", form, "--results", form).returncode == 0
+    default, plain = calls[:2], calls[2:]
+    extra = [
+        set(b.items()) - set(a.items()) - {("--run", b["--run"])}
+        for (_, a), (_, b) in zip(default, plain, strict=True)
+    ]
+    assert extra[0] == {("--world_model.architecture", "plain")}
+    assert {name for name, _ in extra[1]} == {"--pretrained"}
+
+
 @pytest.mark.slow
 def test_real_cells(recordings, tmp_path):
     """A source of columns of its own, with fewer entries than the task has, trains, is evaluated and measured."""
@@ -107,6 +120,7 @@ def test_real_cells(recordings, tmp_path):
     [
         (["--only", "radar"], "'radar'|radar"),
         (["--part", "half"], "'half'"),
+        (["--architecture", "vit"], "'vit'"),
         (["--world_models", "0,3"], "0,3"),
         (["--write"], "results must have results"),
         (["--tasks", "nothing", "--dry_run"], "nothing"),
