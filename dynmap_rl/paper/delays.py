@@ -24,7 +24,7 @@ CONDITIONS = {  # name: text, settings of the frames besides the delay, whether 
     "jitter": ("jitter of 2 steps", {"jitter": 2}, False, False),
     "lost_10": ("10 % of the frames lost", {"lost": 0.1}, False, False),
     "lost_30": ("30 % of the frames lost", {"lost": 0.3}, False, False),
-    "past_actions": ("feed-forward with past actions", {}, False, True),
+    "past_actions": ("with past actions", {}, False, True),
     "pushed": ("unannounced pushes", {}, True, False),
     "pushed_stale": ("unannounced pushes, stale frames", {}, True, True),
 }
@@ -170,7 +170,7 @@ def _draw_lines(axis, lines: dict[str, dict]) -> None:
     axis.set_title("success against the delay of the frames", fontsize=8)
     axis.set_xlabel("delay of the frames [ms]", fontsize=8)
     axis.set_ylabel("success [%]", fontsize=8)
-    axis.legend(fontsize=6)
+    axis.legend(fontsize=6, loc="upper center", bbox_to_anchor=(0.5, -0.16))
 
 
 def _draw_dots(axis, title: str, dots: dict[str, dict[str, dict]]) -> None:
