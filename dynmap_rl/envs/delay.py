@@ -113,6 +113,13 @@ class DelayFrames(gym.Wrapper, gym.utils.RecordConstructorArgs):
         return self._step - taken + (self.delay.error if taken else 0)
 
 
+DELAYS = 4  # number of this stream of random numbers; recordings use 1 to 3 with the same seeds
+
+
 def make_generator(seed: int | None, world: int = 0) -> np.random.Generator:
-    """Make the generator of the delays of one world, which differs from that of the scenes with the same seed."""
-    return np.random.default_rng(None if seed is None else [seed, world])
+    """Make the generator of the delays of one world.
+
+    Its numbers are independent of those of the scene with the same seed. NumPy pads seeds with zeros, so that
+    ``[seed, 0]`` alone would be the seed of the scene.
+    """
+    return np.random.default_rng(None if seed is None else [seed, DELAYS, world])

@@ -161,3 +161,10 @@ def test_a_robot_s_actor_in_the_wrapper_without_delay_is_the_actor():
 def test_settings_are_checked(settings, message):
     with pytest.raises(ValueError, match=message):
         FrameDelay(**settings)
+
+
+@pytest.mark.parametrize("seed", [0, 7, 2**40])
+def test_delays_and_scenes_of_a_seed_are_independent(seed):
+    streams = [np.random.default_rng(seed), *(np.random.default_rng([seed, tag]) for tag in range(1, 4))]
+    streams += [make_generator(seed), make_generator(seed, 1)]
+    assert len({tuple(stream.random(4)) for stream in streams}) == len(streams)
