@@ -132,6 +132,8 @@ def read_delay(config: Config):
     if delay == FrameDelay():
         refuse(config, Config(), ["stale"], "frames in time")
         return None
+    if config.stale:
+        refuse(config, Config(), ["delay_error"], "--stale, which does not read delays")
     return delay
 
 

@@ -63,7 +63,7 @@ class DelayTransform(Transform):
             )
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        pixels = tensordict_reset[self.in_keys[0]].flatten(0, tensordict_reset.ndim - 1)
+        pixels = self._frames_of(tensordict_reset)
         if self._frames is None:
             self._start(pixels)
         mask = tensordict.get("_reset", torch.ones(len(pixels), dtype=torch.bool)).flatten()
@@ -74,7 +74,7 @@ class DelayTransform(Transform):
         return self._deliver(tensordict_reset)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        pixels = next_tensordict[self.in_keys[0]].flatten(0, next_tensordict.ndim - 1)
+        pixels = self._frames_of(next_tensordict)
         self._now += 1
         slot = self._now % len(self._frames)
         delays = [self.delay.draw(generator) for generator in self._generators]
@@ -82,6 +82,11 @@ class DelayTransform(Transform):
         self._arrival[slot] = torch.tensor(arrival, device=pixels.device)
         self._frames[slot] = pixels
         return self._deliver(next_tensordict)
+
+    def _frames_of(self, tensordict: TensorDictBase) -> torch.Tensor:
+        """Return the frames of all worlds ``[N, ...]``; an environment without batch dimensions is one world."""
+        pixels = tensordict[self.in_keys[0]]
+        return pixels.reshape(tensordict.batch_size.numel(), *pixels.shape[tensordict.ndim :])
 
     def _deliver(self, tensordict: TensorDictBase) -> TensorDictBase:
         length, batch = len(self._frames), tensordict.batch_size

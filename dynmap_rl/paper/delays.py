@@ -70,7 +70,7 @@ def delay_page(results: list[dict]) -> str:
     """Return the page of the results: what was measured, the table, and the commands."""
     sizes = sorted({(result["split"], result["episodes"]) for result in results})
     scenes = ", ".join(f"{count} scenes of the split {split}" for split, count in sizes)
-    commands = sorted({result["command"] for result in results})
+    commands = sorted({cell["command"] for result in results for cell in result["cells"].values()})
     return "\n".join(
         [
             "# Success against the delay of the frames",

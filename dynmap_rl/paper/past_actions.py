@@ -144,6 +144,8 @@ class PastActionsActor(TensorDictModuleBase):
     Args:
         world_model: encoder and transition.
         policy: policy.
+
+    Calling it raises ``ValueError`` for a delay above the policy's ``max_delay``.
     """
 
     def __init__(self, world_model: WorldModel, policy: PastActionsPolicy):
@@ -155,6 +157,8 @@ class PastActionsActor(TensorDictModuleBase):
         """Write the action and the next memory."""
         batch, policy, model = tensordict.batch_size, self.policy, self.model
         memory, age = tensordict.get("memory", None), tensordict["delay"]
+        if age.max() > policy.max_delay:
+            raise ValueError(f"delay must be at most {policy.max_delay} steps, got {age.max()}")
         latent = model.encode(tensordict["pixels"], mixed=True)
         if memory is None:
             state = model.initial_state(len(latent), latent.device)

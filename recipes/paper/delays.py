@@ -136,10 +136,9 @@ def evaluate_cell(config: Config, path: Path, result: dict, steps: int) -> None:
     workers = config.compute.threads if has_world_model(find_run(result["run"])) else 1
     found = evaluate(actor, result["task"], config.eval, delay, pushed, workers)["test"]
     cell = {name: found["summary"][name] for name in ("SR", "SR_interval", "DR", "DR_interval", "PE")}
-    cell |= {"success": found["rows"]["success"], "commit": find_commit()}
+    cell |= {"success": found["rows"]["success"], "command": command_line(sys.argv), "commit": find_commit()}
     result |= names
     result["cells"][str(steps)] = cell
-    result["command"] = command_line(sys.argv)
     write_json(path, result)
     print(f"    SR {cell['SR']:.1f} %   DR {cell['DR']:.1f} %   PE {cell['PE']:.1f} mm", flush=True)
 

@@ -6,7 +6,7 @@ import gymnasium as gym
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import ParallelEnv, TransformedEnv
+from torchrl.envs import GymWrapper, ParallelEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 import dynmap_rl  # noqa: F401 (registers the tasks)
@@ -131,3 +131,11 @@ def test_around_environments_in_processes_of_their_own():
         env.reset(TensorDict({"_reset": torch.ones(2, 3, 1, dtype=torch.bool)}, [2, 3]))
     finally:
         env.close()
+
+
+def test_an_environment_without_batch_dimensions_is_one_world():
+    env = GymWrapper(gym.make("dynmap_rl/BalanceReaching-v1", obs_type="pixels"))
+    late = TransformedEnv(env, DelayTransform(FrameDelay(2), seed=0))
+    frames = late.rollout(5)
+    assert frames["delay"].flatten().tolist() == [0, 1, 2, 2, 2]
+    assert frames["pixels"].shape == (5, 64, 64, 3) and torch.equal(frames["pixels"][1], frames["pixels"][0])

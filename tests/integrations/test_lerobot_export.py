@@ -130,3 +130,11 @@ def test_a_late_chunk_is_cut_at_the_present_step(tmp_path):
     actor.reset()
     assert actor(td.set("delay", torch.tensor([[0], [7]])))["action"][:, 0].tolist() == [30, 34]
     assert len(calls) == 3
+
+
+def test_chunks_of_several_observations_are_not_cut(tmp_path):
+    policy = export_to_lerobot("balance_reaching", tmp_path)
+    settings = read_json(policy / "config.json")
+    write_json(policy / "config.json", settings | {"n_obs_steps": 2})
+    with pytest.raises(ValueError, match="2 observations"):
+        LeRobotActor(policy, cut=True)

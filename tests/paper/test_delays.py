@@ -10,9 +10,12 @@ from dynmap_rl.utils.files import write_json
 
 def make_results(folder):
     for condition, rates in (("imagined", {0: 99.0, 10: 95.0}), ("stale", {0: 99.0, 10: 5.0, 30: 0.0})):
-        cells = {str(d): {"SR": rate, "SR_interval": [rate - 1, rate + 1]} for d, rate in rates.items()}
+        cells = {
+            str(d): {"SR": rate, "SR_interval": [rate - 1, rate + 1], "command": f"python {condition} {d}"}
+            for d, rate in rates.items()
+        }
         facts = {"task": "balance_reaching", "row": "RGB+[P]", "policy": "recurrent", "condition": condition}
-        facts |= {"split": "test", "episodes": 50, "command": f"python {condition}"}
+        facts |= {"split": "test", "episodes": 50}
         write_json(folder / f"{condition}.json", facts | {"cells": cells})
     return delays.read_delays(folder)
 
@@ -24,7 +27,7 @@ def test_the_table_has_a_line_for_each_condition_and_a_column_for_each_delay(tmp
     assert stale == ["**99.0** [98.0, 100.0]", "**5.0** [4.0, 6.0]", "**0.0** [-1.0, 1.0]"]
     assert imagined == ["**99.0** [98.0, 100.0]", "**95.0** [94.0, 96.0]", ""]
     page = delays.delay_page(make_results(tmp_path))
-    assert "python imagined" in page and "50 scenes" in page
+    assert "python imagined 0\npython imagined 10" in page and "50 scenes" in page
 
 
 def test_long_results_are_lines_and_others_are_dots_of_supervisions_and_conditions(tmp_path, monkeypatch):

@@ -27,10 +27,13 @@ class LeRobotActor(TensorDictModuleBase):
         device: device to run on.
         instruction: text for policies that read one; datasets of the tasks have the task's ``description``.
         cut: on late frames, execute a chunk from its action for the present step, by the entry ``delay`` ``[B, 1]``,
-            rather than from its first action. Needs a policy with ``n_action_steps`` that predicts chunks.
+            rather than from its first action. Needs a policy that predicts chunks from one observation, such as ACT.
+            ``agent_pos`` is that of the present, and a chunk that is shorter than delay and ``n_action_steps`` together
+            ends with repetitions of its last action.
 
     Raises:
-        ValueError: the folder or id holds no LeRobot policy.
+        ValueError: the folder or id holds no LeRobot policy, or ``cut`` is given and the policy predicts from several
+            observations.
 
     Calling it raises ``ValueError`` where the policy has another number of cameras.
     """
@@ -59,6 +62,10 @@ class LeRobotActor(TensorDictModuleBase):
             raise ValueError(
                 f"{path} must be a policy of LeRobot, but it cannot be loaded ({reason}); check the path"
             ) from error
+        if cut and config.n_obs_steps != 1:
+            raise ValueError(
+                f"cut must be False for the policy type {config.type}, which predicts from {config.n_obs_steps} observations"
+            )
         self.reset()
 
     def reset(self) -> None:
