@@ -9,8 +9,7 @@
 
 A policy acts on frames in closed loop; the result is drop rate, position error and success rate. An expert acts on
 states; the result is the rates of success, drops and touches, and for task 2 how often the straight path to the goal is
-blocked, and how often the shortest way leads around the obstacle. Rates have 95 % Wilson intervals. A folder in
-runs/evaluate gets the numbers and a page with some of the episodes, failures first.
+blocked, and the shortest one leads around it. Rates have 95 % Wilson intervals. runs/evaluate gets numbers and a page.
 """
 
 import sys
@@ -129,11 +128,10 @@ def read_delay(config: Config):
     from dynmap_rl.envs.delay import FrameDelay
 
     delay = FrameDelay(config.delay, config.jitter, config.lost, config.delay_error)
-    if delay == FrameDelay():
-        refuse(config, Config(), ["stale"], "frames in time")
-        return None
     if config.stale:
         refuse(config, Config(), ["delay_error"], "--stale, which does not read delays")
+    if delay == FrameDelay():
+        return refuse(config, Config(), ["stale"], "frames in time")
     return delay
 
 

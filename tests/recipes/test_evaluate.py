@@ -128,6 +128,7 @@ def test_late_frames_bridged_or_stale(tmp_path, monkeypatch):
         (["--eval.split", "holiday"], "holiday"),
         (["--delay", "6"], "--delay has no effect with an expert"),
         (["--policy", "balance_reaching", "--stale"], "--stale"),
+        (["--policy", "balance_reaching", "--delay", "6", "--delay_error", "1", "--stale"], "--delay_error"),
         (["--policy", "balance_reaching", "--delay", "-1"], "steps must be at least 0"),
         (["--policy", "balance_reaching", "--jitter", "2"], "jitter must be at most the delay"),
         (
