@@ -34,7 +34,7 @@ class Config:
     seed: int = 0
     # Task, such as mujoco:FetchPush, or module:Class of your own; by default that of the run, else balance_reaching.
     task: str | None = None
-    # Delay of the frames in control steps of 50 ms. The world model imagines the steps up to the present.
+    # Delay of the frames in control steps. The world model imagines the steps up to the present.
     delay: int = 0
     # Largest deviation from --delay, in control steps; frames then arrive out of order and in bursts.
     jitter: int = 0

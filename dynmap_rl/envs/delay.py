@@ -100,12 +100,12 @@ class DelayFrames(gym.Wrapper, gym.utils.RecordConstructorArgs):
         arrived = {taken: self._frames.pop(taken) for taken in sorted(self._due.pop(self._step, ()))}
         if arrived and max(arrived) > self._taken:
             self._taken = max(arrived)
-            self._newest = arrived[self._taken]
+            self._newest = arrived[self._taken].copy()  # a caller may change what it gets
         info |= {
             "delay": np.int64(self._report(self._taken)),
             "arrived": {self._report(taken): frame for taken, frame in arrived.items()},
         }
-        newest = self._newest.copy()  # a caller may change what it gets
+        newest = self._newest.copy()
         return newest if self.key is None else observation | {self.key: newest}, info
 
     def _report(self, taken: int) -> int:

@@ -24,7 +24,8 @@ class RobotActor:
     The episode begins with the first call of :meth:`act`, which needs a frame. The robot is at rest before it, so that
     the newest frame then counts as the frame of that moment. Every later frame belongs to the call of :meth:`act` that is
     nearest to its timestamp; frames older than ``max_delay`` steps are not used. Where a call comes so late that control
-    steps were missed, these count as steps with an action of zero.
+    steps were missed, these count as steps with an action of zero; after a longer gap than ``max_delay`` steps, the robot
+    is at rest, and only the last ``max_delay`` of them count.
 
     Args:
         actor: world model and policy.
@@ -84,7 +85,7 @@ class RobotActor:
         """Predict the control steps without an action since the last call."""
         last = self.times[-1]
         steps = round((now - last) / self.period)
-        for i in range(1, steps):
+        for i in range(max(1, steps - self.actor.max_delay), steps):
             self.times.append(last + i * (now - last) / steps)
             td = self.actor.observe(self.memory.copy())
             size = self.actor.world_model.transition.action.size

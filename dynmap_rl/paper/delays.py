@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
 from dynmap_rl.envs.delay import FrameDelay
-from dynmap_rl.envs.world import CONTROL_DT
+from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.reporting.figures import plt, save_figure
 from dynmap_rl.utils.files import read_json
 
@@ -52,12 +53,14 @@ def read_delays(folder: Path) -> list[dict]:
 
 def delay_table(results: list[dict]) -> str:
     """Return SR (%) with 95 % Wilson intervals as a table in Markdown: a line for each run and condition."""
-    delays = sorted({int(steps) for result in results for steps in result["cells"]})
-    header = ["task", "world model", "policy", "condition"]
-    header += [f"{_milliseconds(steps)} ms" for steps in delays]
+    cells_by_time = [
+        {_milliseconds(result, steps): c for steps, c in result["cells"].items()} for result in results
+    ]
+    times = sorted(set().union(*cells_by_time))
+    header = ["task", "world model", "policy", "condition", *(f"{time} ms" for time in times)]
     lines = []
-    for result in results:
-        cells = [result["cells"].get(str(steps)) for steps in delays]
+    for result, found in zip(results, cells_by_time, strict=True):
+        cells = [found.get(time) for time in times]
         values = [
             f"**{c['SR']:.1f}** [{c['SR_interval'][0]:.1f}, {c['SR_interval'][1]:.1f}]" if c else ""
             for c in cells
@@ -96,15 +99,15 @@ def delay_page(results: list[dict]) -> str:
 def plot_delays(results: list[dict], path: Path) -> None:
     """Draw success with its intervals: lines against the delay, and dots for what was measured at a few delays.
 
-    Results with more than two delays are lines in the first panel. The other panels have a line of dots for each: the
-    supervisions of every task, rolled forward, at each delay, and the conditions at their delay. A panel without results
-    is left out.
+    Results with more than four delays are lines in the first panel. The other panels have a line of dots for each
+    supervision of a task and a policy, on stale frames and rolled forward, or for each condition. A panel with less than
+    two lines is left out.
 
     Args:
         results: see :func:`read_delays`.
         path: file to write.
     """
-    lines = {_text(r): r for r in results if len(r["cells"]) > 2}
+    lines = {_text(r): r for r in results if len(r["cells"]) > 4}
     panels = [(title, dots) for title, dots in _dots(results).items() if len(dots) > 1]
     count = bool(lines) + len(panels)
     columns = min(count, 3) or 1
@@ -137,26 +140,35 @@ def _text(result: dict) -> str:
     return f"{task}{row}: {condition_text(result)}"
 
 
-def _milliseconds(steps: int | str) -> int:
-    return round(1000 * CONTROL_DT * int(steps))
+def _milliseconds(result: dict, steps: int | str) -> int:
+    return round(1000 * get_task(result["task"]).layout.dt * int(steps))
 
 
 def _dots(results: list[dict]) -> dict[str, dict[str, dict[str, dict]]]:
     """Return the cells of each panel of dots, by their line and their marker."""
     panels = {}
     for result in results:
-        task, policy, condition = (result[name] for name in ("task", "policy", "condition"))
+        task, row, policy, condition = (result[name] for name in ("task", "row", "policy", "condition"))
         if policy == "LeRobot" or condition == "past_actions":
             continue
         for steps, cell in sorted(result["cells"].items(), key=lambda item: int(item[0])):
-            at = f"{_milliseconds(steps)} ms"
-            if condition == "imagined" and int(steps):
-                panel = panels.setdefault(f"{task}, rolled forward, {at}", {})
-                panel.setdefault(result["row"], {})[policy] = cell
-            if len(result["cells"]) < 3 and condition != "imagined":
-                panel = panels.setdefault(f"{task}, {result['row']}, {policy}: conditions", {})
-                panel.setdefault(condition_text(result), {})[at] = cell
-    return panels
+            at, text = f"{_milliseconds(result, steps)} ms", condition_text(result)
+            if condition in ("stale", "imagined") and int(steps):
+                panel = panels.setdefault(f"{task}, {policy}", {})
+                panel.setdefault(row, {})[f"{text}, {at}"] = cell
+            elif condition not in ("stale", "imagined"):
+                panel = panels.setdefault(f"{task}, {row}, {policy}: conditions", {})
+                panel.setdefault(text, {})[at] = cell
+    return {
+        title: panel if title.endswith("conditions") else _drop_rare(panel) for title, panel in panels.items()
+    }
+
+
+def _drop_rare(panel: dict[str, dict[str, dict]]) -> dict[str, dict[str, dict]]:
+    """Return the panel without the markers of a single line, which nothing is compared with."""
+    count = Counter(name for cells in panel.values() for name in cells)
+    kept = {line: {name: c for name, c in cells.items() if count[name] > 1} for line, cells in panel.items()}
+    return {line: cells for line, cells in kept.items() if cells}
 
 
 def _draw_lines(axis, lines: dict[str, dict]) -> None:
@@ -165,7 +177,7 @@ def _draw_lines(axis, lines: dict[str, dict]) -> None:
         cells = [result["cells"][str(step)] for step in steps]
         rates, errors = [cell["SR"] for cell in cells], _errors(cells)
         style = "--" if CONDITIONS[result["condition"]][3] else "-"
-        time = [_milliseconds(step) for step in steps]
+        time = [_milliseconds(result, step) for step in steps]
         axis.errorbar(time, rates, errors, ls=style, lw=1.4, elinewidth=1, capsize=2, marker=".", label=label)
     axis.set_title("success against the delay of the frames", fontsize=8)
     axis.set_xlabel("delay of the frames [ms]", fontsize=8)
@@ -174,23 +186,13 @@ def _draw_lines(axis, lines: dict[str, dict]) -> None:
 
 
 def _draw_dots(axis, title: str, dots: dict[str, dict[str, dict]]) -> None:
-    names, markers = list(dots), sorted({name for cells in dots.values() for name in cells})
-    for marker, (index, label) in zip("os^Dv", enumerate(markers), strict=False):
+    names, markers = list(dots), dict.fromkeys(name for cells in dots.values() for name in cells)
+    for marker, (index, label) in zip("os^Dv<>P", enumerate(markers), strict=False):
         shift = 0.15 * (index - (len(markers) - 1) / 2)
         found = [(place + shift, cells[label]) for place, cells in enumerate(dots.values()) if label in cells]
         places, cells = zip(*found, strict=True)
-        rates, color = [cell["SR"] for cell in cells], "C1" if label == "recurrent" else f"C{index}"
-        axis.errorbar(
-            rates,
-            places,
-            xerr=_errors(cells),
-            ls="",
-            color=color,
-            marker=marker,
-            ms=4,
-            capsize=2,
-            label=label,
-        )
+        rates, style = [cell["SR"] for cell in cells], {"ls": "", "marker": marker, "ms": 4, "capsize": 2}
+        axis.errorbar(rates, places, xerr=_errors(cells), label=label, **style)
     axis.set_yticks(range(len(names)), names)
     axis.invert_yaxis()
     axis.set_title(title, fontsize=8)

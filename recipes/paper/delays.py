@@ -40,7 +40,7 @@ class Config:
     dataset: str | None = None
     # Conditions with commas between; by default all.
     conditions: str = ""
-    # Delays in control steps of 50 ms, with commas between; by default 0 to 30.
+    # Delays in control steps, with commas between; by default 0 to 30.
     delays: str = ""
     # Folder of the results.
     results: Path = RESULTS / "delays"

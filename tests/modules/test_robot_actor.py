@@ -99,6 +99,16 @@ def test_missed_steps_have_no_action():
     np.testing.assert_array_equal(action, td["action"].numpy())
 
 
+def test_a_long_gap_takes_no_more_steps_than_the_longest_delay(monkeypatch):
+    robot, calls = make_robot(), []
+    robot.observe(FRAMES[0], 0.0)
+    robot.act(0.0)
+    predict = robot.actor.predict
+    monkeypatch.setattr(robot.actor, "predict", lambda td: calls.append(1) or predict(td))
+    assert np.isfinite(robot.act(1e5)).all()
+    assert len(calls) == robot.actor.max_delay + 1
+
+
 def test_reset_forgets_the_episode_and_takes_a_goal():
     robot = make_robot()
     actions = []

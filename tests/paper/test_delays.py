@@ -34,16 +34,28 @@ def test_long_results_are_lines_and_others_are_dots_of_supervisions_and_conditio
     saved = []
     monkeypatch.setattr(delays, "save_figure", lambda figure, path: saved.append(figure))
     stale, imagined = make_results(tmp_path)
-    other, jitter = imagined | {"row": "Only-RGB"}, imagined | {"condition": "jitter"}
-    act = imagined | {"row": "act", "policy": "LeRobot", "cells": stale["cells"]}
-    delays.plot_delays([stale, imagined, other, jitter, act], tmp_path / "figure.png")
+    long = imagined | {"row": "act", "policy": "LeRobot"}
+    long["cells"] = {str(steps): stale["cells"]["10"] for steps in (0, 2, 4, 6, 8)}
+    others = [result | {"row": "Only-RGB"} for result in (stale, imagined)]
+    delays.plot_delays([stale, imagined, *others, long], tmp_path / "figure.png")
     lines, supervisions = saved[0].axes
     assert read_lines(lines) == {
-        "RGB+[P], recurrent: stale frames": [[0, 99], [500, 5], [1500, 0]],
-        "ACT: chunks from the present step": [[0, 99], [500, 5], [1500, 0]],
+        "ACT: chunks from the present step": [[0, 5], [100, 5], [200, 5], [300, 5], [400, 5]]
     }
-    assert read_lines(supervisions) == {"recurrent": [[95, 0], [95, 1]]}
+    found = read_lines(supervisions)
+    assert [*found] == ["stale frames, 500 ms", "stale frames, 1500 ms", "rolled forward, 500 ms"]
+    assert found["rolled forward, 500 ms"] == [[95, 0.15], [95, 1.15]]
     assert [label.get_text() for label in supervisions.get_yticklabels()] == ["RGB+[P]", "Only-RGB"]
+    plt.close("all")
+
+
+def test_a_marker_of_one_supervision_is_left_out(tmp_path, monkeypatch):
+    saved = []
+    monkeypatch.setattr(delays, "save_figure", lambda figure, path: saved.append(figure))
+    stale, imagined = make_results(tmp_path)
+    other = imagined | {"row": "Only-RGB"}
+    delays.plot_delays([stale, imagined, other], tmp_path / "figure.png")
+    assert [*read_lines(saved[0].axes[0])] == ["rolled forward, 500 ms"]
     plt.close("all")
 
 
