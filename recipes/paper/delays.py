@@ -14,7 +14,7 @@ actions of the delay are cut; train one with the command in dynmap_rl/integratio
 """
 
 import sys
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 
@@ -109,8 +109,10 @@ def open_result(config: Config, run: str, condition: str) -> tuple[Path, dict]:
     path = config.results / f"{name}.json"
     facts = {"run": run, "seed": config.seed, "task": task, "condition": condition}
     facts |= {"split": config.eval.split, "episodes": config.eval.episodes}
+    if condition == "past_actions":
+        facts |= {"dataset": config.dataset, "training": asdict(config.policy)}
     result = read_json(path) if path.exists() else facts | {"cells": {}}
-    if other := [key for key, value in facts.items() if result[key] != value]:
+    if other := [key for key, value in facts.items() if result.get(key) != value]:
         raise ValueError(
             f"{path} has another {', '.join(other)}; choose another --results or remove the file"
         )

@@ -66,6 +66,8 @@ def test_the_baseline_with_past_actions_is_trained_on_the_run_s_world_model(grid
     assert result.returncode == 0, result.stderr
     found = read_json(tmp_path / "found/balance_reaching_trained_seed_0_past_actions.json")
     assert set(found["cells"]) == {"0", "2"} and found["policy"] == "feedforward"
+    result = grid("--conditions", "past_actions", "--dataset", recording, "--policy.updates", 3)
+    assert result.returncode == 2 and "another training" in result.stderr
 
 
 @pytest.mark.parametrize(
