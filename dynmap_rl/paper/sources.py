@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Container
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 from dynmap_rl.data.derive import add_dynamics
@@ -127,6 +128,27 @@ def cell_name(task: str, source: str, seed: int, policy: str, size: int = 300) -
     amount = "" if size == 300 else f"_{size}_demonstrations"
     model = "" if source == "end_to_end" else f"_world_model_{seed}"
     return f"{get_task(task).name}_{source}{amount}{model}_{policy}"
+
+
+def find_table_cells(tables: Path, architecture: str = "glimpse") -> dict[str, Path]:
+    """Return results of the runs of the paper's tables that are cells of this grid too, by the name of the cell.
+
+    These are the cells of task 1 with the simulator's dynamics, and with none.
+
+    Args:
+        tables: folder of the results of ``recipes/paper/tables.py``.
+        architecture: form of the world models.
+    """
+    training, found = "decoupled" if architecture == "glimpse" else architecture, {}
+    for source, seed, policy in product(("simulator", "none"), WORLD_MODELS, POLICIES):
+        supervision, suffix = (
+            SOURCES[source].supervision.replace(",", "_"),
+            f"_world_model_{seed}" if seed else "",
+        )
+        path = tables / f"{TASKS[0]}_{training}_{supervision}_{policy}{suffix}.json"
+        if path.exists():
+            found[cell_name(TASKS[0], source, seed, policy)] = path
+    return found
 
 
 def dataset_folder(task: str, source: str, datasets: Path, size: int = 300) -> Path:

@@ -10,7 +10,7 @@
 The table has a world model for each source of dynamics and seed, with recurrent and feed-forward policies (see
 dynmap_rl/paper/sources.py). Its datasets are derived from the recordings of the tasks where they are missing. A cell is a
 run of recipes/decoupled.py or end_to_end.py; a result is a JSON file, cells with a result are skipped, and the same
-command resumes a stopped grid. Every world model is then measured by linear maps. The folder of the results gets
+command resumes a stopped grid. Runs of recipes/paper/tables.py with the same training are not repeated. Every world model is then measured by linear maps. The folder of the results gets
 README.md with the tables and the rank correlation of the measures with success, and the figures.
 """
 
@@ -42,6 +42,9 @@ class Config:
     architecture: str = "glimpse"
     # Folder of the cells' results; by default recipes/results/sources, or sources_plain.
     results: Path | None = None
+    # Results of recipes/paper/tables.py that are cells of task 1 too; by default recipes/results/cells, if --results
+    # is not given.
+    tables: Path | None = None
     # Folder of the cells' runs; by default runs/sources, or runs/sources_plain.
     runs: Path | None = None
     # Folder of the derived datasets.
@@ -68,20 +71,27 @@ class Config:
 def main(config: Config) -> None:
     """Run the cells without a result, measure, and write."""
     name = "sources" if config.architecture == "glimpse" else f"sources_{config.architecture}"
+    tables = config.tables or (None if config.results else RESULTS / "cells")
     config = replace(
         config, results=config.results or RESULTS / name, runs=config.runs or Path("runs") / name
     )
     from dynmap_rl.paper.launch import execute, has_run, is_done, launch, print_runs
-    from dynmap_rl.paper.sources import make_datasets
+    from dynmap_rl.paper.sources import find_table_cells, make_datasets
+    from dynmap_rl.utils.files import read_json, write_json
 
     if config.write:
         return write(config)
     cells = choose_cells(config)
+    shared = find_table_cells(tables, config.architecture) if tables else {}
     todo = [cell for cell in cells if not is_done(cell.name, config.results)]
+    shared = {cell.name: shared[cell.name] for cell in todo if cell.name in shared}
+    todo = [cell for cell in todo if cell.name not in shared]
     needed = {cell.needs for cell in todo if cell.needs and not has_run(cell.needs, config.runs)}
     todo = [cell for cell in cells if cell in todo or cell.name in needed]
     if config.dry_run:
         return print_runs(cells, todo)
+    for name, path in shared.items():
+        write_json(config.results / f"{name}.json", read_json(path))
     make_datasets(todo, config.datasets, workers=2 if config.workers == 1 else config.workers)
     run = partial(
         execute, recipes=RECIPES, results=config.results, runs=config.runs,

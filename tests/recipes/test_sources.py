@@ -98,6 +98,21 @@ def test_cells_of_the_plain_architecture_differ_in_the_training_of_their_world_m
     assert {name for name, _ in extra[1]} == {"--pretrained"}
 
 
+def test_runs_of_the_tables_are_not_repeated(calls, tmp_path):
+    rows = {"success": "1", "dropped": "0", "touched": "0", "first_scene_seed": 0, "position_error": [0.01]}
+    for policy in ("recurrent", "feedforward"):
+        result = {"results": [{"test": {"rows": rows}}], "command": policy}
+        write_json(tmp_path / f"cells/{TASK}_plain_none_{policy}_world_model_1.json", result)
+    only = "--part", "table", "--only", "none", "--world_models", "1", "--tables", "cells"
+    plain = run(tmp_path, *only, "--architecture", "plain", "--dry_run").stdout
+    assert plain.splitlines()[-1].startswith("2 of 2") and not (tmp_path / "results").exists()
+    assert run(tmp_path, *only, "--dry_run").stdout.splitlines()[-1].startswith("0 of 2")
+    assert run(tmp_path, *only, "--architecture", "plain").returncode == 0 and calls == []
+    for policy in ("recurrent", "feedforward"):
+        copied = read_json(tmp_path / f"results/{TASK}_none_world_model_1_{policy}.json")
+        assert copied["command"] == policy
+
+
 @pytest.mark.slow
 def test_real_cells(recordings, tmp_path):
     """A source of columns of its own, with fewer entries than the task has, trains, is evaluated and measured."""
