@@ -100,7 +100,7 @@ def plot_delays(results: list[dict], path: Path) -> None:
     """Draw success with its intervals: lines against the delay, and dots for what was measured at a few delays.
 
     Results with more than four delays are lines in the first panel. The other panels have a line of dots for each
-    supervision of a task and a policy, on stale frames and rolled forward, or for each condition. A panel with less than
+    supervision and policy of a task, on stale frames and rolled forward, or for each condition. A panel with less than
     two lines is left out.
 
     Args:
@@ -152,13 +152,13 @@ def _dots(results: list[dict]) -> dict[str, dict[str, dict[str, dict]]]:
         if policy == "LeRobot" or condition == "past_actions":
             continue
         for steps, cell in sorted(result["cells"].items(), key=lambda item: int(item[0])):
-            at, text = f"{_milliseconds(result, steps)} ms", condition_text(result)
-            if condition in ("stale", "imagined") and int(steps):
-                panel = panels.setdefault(f"{task}, {policy}", {})
-                panel.setdefault(row, {})[f"{text}, {at}"] = cell
-            elif condition not in ("stale", "imagined"):
+            time, text = _milliseconds(result, steps), condition_text(result)
+            if condition in ("stale", "imagined"):
+                panel = panels.setdefault(task, {}).setdefault(f"{row}, {policy}", {})
+                panel[f"{text}, {time} ms" if time else "no delay"] = cell
+            else:
                 panel = panels.setdefault(f"{task}, {row}, {policy}: conditions", {})
-                panel.setdefault(text, {})[at] = cell
+                panel.setdefault(text, {})[f"{time} ms"] = cell
     return {
         title: panel if title.endswith("conditions") else _drop_rare(panel) for title, panel in panels.items()
     }
@@ -186,18 +186,24 @@ def _draw_lines(axis, lines: dict[str, dict]) -> None:
 
 
 def _draw_dots(axis, title: str, dots: dict[str, dict[str, dict]]) -> None:
-    names, markers = list(dots), dict.fromkeys(name for cells in dots.values() for name in cells)
-    for marker, (index, label) in zip("os^Dv<>P", enumerate(markers), strict=False):
+    names, markers = list(dots), sorted({name for cells in dots.values() for name in cells}, key=_order)
+    for shape, (index, label) in zip("os^Dv<>P", enumerate(markers), strict=False):
         shift = 0.15 * (index - (len(markers) - 1) / 2)
         found = [(place + shift, cells[label]) for place, cells in enumerate(dots.values()) if label in cells]
         places, cells = zip(*found, strict=True)
-        rates, style = [cell["SR"] for cell in cells], {"ls": "", "marker": marker, "ms": 4, "capsize": 2}
-        axis.errorbar(rates, places, xerr=_errors(cells), label=label, **style)
+        rates, style = [cell["SR"] for cell in cells], {"ls": "", "marker": shape, "ms": 4, "capsize": 2}
+        color = {"no delay": "C7", "stale": "C1"}.get(label.split(" frames")[0], "C0")
+        axis.errorbar(rates, places, xerr=_errors(cells), label=label, color=color, **style)
     axis.set_yticks(range(len(names)), names)
     axis.invert_yaxis()
     axis.set_title(title, fontsize=8)
     axis.set_xlabel("success [%]", fontsize=8)
-    axis.legend(fontsize=6)
+    axis.legend(fontsize=6, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
+
+
+def _order(label: str) -> tuple[bool, bool, int]:
+    """Return the place of a marker: without delay, on stale frames, rolled forward; the shorter delay first."""
+    return label != "no delay", "stale" not in label, int("".join(filter(str.isdigit, label)) or 0)
 
 
 def _errors(cells: Sequence[dict]) -> list[list[float]]:

@@ -43,9 +43,11 @@ def test_long_results_are_lines_and_others_are_dots_of_supervisions_and_conditio
         "ACT: chunks from the present step": [[0, 5], [100, 5], [200, 5], [300, 5], [400, 5]]
     }
     found = read_lines(supervisions)
-    assert [*found] == ["stale frames, 500 ms", "stale frames, 1500 ms", "rolled forward, 500 ms"]
-    assert found["rolled forward, 500 ms"] == [[95, 0.15], [95, 1.15]]
-    assert [label.get_text() for label in supervisions.get_yticklabels()] == ["RGB+[P]", "Only-RGB"]
+    markers = ["no delay", "stale frames, 500 ms", "stale frames, 1500 ms", "rolled forward, 500 ms"]
+    assert [*found] == markers
+    assert [rate for rate, _ in found["rolled forward, 500 ms"]] == [95, 95]
+    names = [label.get_text() for label in supervisions.get_yticklabels()]
+    assert names == ["RGB+[P], recurrent", "Only-RGB, recurrent"]
     plt.close("all")
 
 
@@ -55,7 +57,7 @@ def test_a_marker_of_one_supervision_is_left_out(tmp_path, monkeypatch):
     stale, imagined = make_results(tmp_path)
     other = imagined | {"row": "Only-RGB"}
     delays.plot_delays([stale, imagined, other], tmp_path / "figure.png")
-    assert [*read_lines(saved[0].axes[0])] == ["rolled forward, 500 ms"]
+    assert [*read_lines(saved[0].axes[0])] == ["no delay", "rolled forward, 500 ms"]
     plt.close("all")
 
 
