@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Any
 
 import gymnasium as gym
@@ -31,7 +32,10 @@ class FrameDelay:
     error: int = 0
 
     def __post_init__(self):
-        check_at_least(self, 0, "steps", "jitter", "lost")
+        for name in ("steps", "jitter", "error"):
+            if not isinstance(value := getattr(self, name), Integral):
+                raise ValueError(f"FrameDelay.{name} must be a whole number of control steps, got {value}")
+        check_at_least(self, 0, "steps", "jitter")
         if self.jitter > self.steps:
             raise ValueError(
                 f"FrameDelay.jitter must be at most the delay of {self.steps} steps, got {self.jitter}"
@@ -41,7 +45,7 @@ class FrameDelay:
                 f"FrameDelay.error must be at least {self.jitter - self.steps}, so that no reported delay is negative, "
                 f"got {self.error}"
             )
-        if self.lost > 1:
+        if not 0 <= self.lost <= 1:
             raise ValueError(f"FrameDelay.lost must be a probability, 0 to 1, got {self.lost}")
 
     @property
@@ -96,7 +100,8 @@ class DelayFrames(gym.Wrapper, gym.utils.RecordConstructorArgs):
         """Send a new frame off, and return what arrives in this step."""
         if delay is not None:
             self._due[self._step + delay].append(self._step)
-            self._frames[self._step] = observation if self.key is None else observation[self.key]
+            frame = observation if self.key is None else observation[self.key]
+            self._frames[self._step] = frame.copy()  # an environment may use its buffer again
         arrived = {taken: self._frames.pop(taken) for taken in sorted(self._due.pop(self._step, ()))}
         if arrived and max(arrived) > self._taken:
             self._taken = max(arrived)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from numbers import Integral
 
 import torch
 from tensordict import TensorDictBase
@@ -26,7 +27,8 @@ class DelayTransform(Transform):
     Args:
         delay: how frames arrive.
         seed: seed of the delays, or one seed for each world. The same seed gives a world the same delays with and
-            without ``bursts``, and in :class:`dynmap_rl.envs.DelayFrames`.
+            without ``bursts``, and in :class:`dynmap_rl.envs.DelayFrames`. The seed of the environment does not
+            determine the delays, which go on from episode to episode; a new transform repeats them.
         bursts: deliver every frame that arrives, rather than the newest.
         pixels: key of the frames, which is read and written.
         delay_key: key of the delays, which is written.
@@ -53,7 +55,7 @@ class DelayTransform(Transform):
         self._arrival = torch.full((length, count), NEVER, device=device)
         self._newest, self._taken = pixels.clone(), torch.full((count,), NEVER, device=device)
         self._began = torch.zeros(count, dtype=torch.int64, device=device)  # step of the first frame
-        if self.seed is None or isinstance(self.seed, int):
+        if self.seed is None or isinstance(self.seed, Integral):
             self._generators = [make_generator(self.seed, world) for world in range(count)]
         else:
             self._generators = [make_generator(seed) for seed in self.seed]

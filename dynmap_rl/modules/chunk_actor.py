@@ -45,7 +45,7 @@ class ChunkActor:
             pixels: frames uint8 ``[B, 3, 64, 64]``.
             goal: goals ``[B, G]`` (SI units).
             step: number of the step before which the frames were taken, from 0. A step before that of the last call
-                begins a new episode. By default, the whole last chunk has been executed since the last frame.
+                begins a new episode, as does :meth:`reset`. By default, the whole last chunk has been executed since the last frame.
         """
         step = max(self.steps, default=-1) + 1 if step is None else step
         if step < self.first:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from numbers import Integral
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -28,7 +30,8 @@ class DelayedActor(TensorDictModuleBase):
     present, and that ``history``, a TensorDict, is read at t and written under ``next``. It also reads ``delay`` int64
     ``[..., 1]``: the number of steps since the frame in ``pixels`` was taken. Several frames that arrive in the same
     step have one more axis, ``pixels`` ``[..., M, 3, 64, 64]`` and ``delay`` ``[..., M]``, in any order. A negative delay
-    marks a place without a frame, and frames from before the episode are not used.
+    marks a place without a frame, and frames from before the episode are not used. Of several frames of one step, the last
+    is used.
     :class:`dynmap_rl.envs.DelayTransform` writes both entries. Without ``delay`` in the TensorDict, every frame is as old
     as the argument ``delay``, or the first one of the episode. Without ``pixels``, no frame has arrived.
 
@@ -44,7 +47,8 @@ class DelayedActor(TensorDictModuleBase):
         history: key of the remembered steps, which is read and written.
 
     Raises:
-        ValueError: ``delay`` is negative or above ``max_delay``.
+        ValueError: ``delay`` is negative, above ``max_delay`` or not whole; or, in a call, there is not one delay for
+            each frame.
     """
 
     def __init__(
@@ -57,6 +61,8 @@ class DelayedActor(TensorDictModuleBase):
     ):
         super().__init__()
         max_delay = delay if max_delay is None else max_delay
+        if not all(isinstance(steps, Integral) for steps in (delay, max_delay)):
+            raise ValueError(f"delay and max_delay must be whole steps, got {delay} and {max_delay}")
         if not 0 <= delay <= max_delay:
             raise ValueError(f"delay must be between 0 and max_delay, got {delay} and {max_delay}")
         self.actor, self.delay, self.max_delay = actor, delay, max_delay
@@ -145,6 +151,11 @@ class DelayedActor(TensorDictModuleBase):
         delay = tensordict.get(self.delay_key, step.clamp(max=self.delay))
         if pixels.ndim == tensordict.ndim + 3:
             pixels = pixels.unsqueeze(-4)  # (..., M, 3, 64, 64) with M = 1
+        if delay.shape != pixels.shape[:-3] or delay.is_floating_point():
+            raise ValueError(
+                f"{self.delay_key} must be int64 {list(pixels.shape[:-3])}, a delay for each frame, "
+                f"got {delay.dtype} {list(delay.shape)}"
+            )
         used = ((delay >= 0) & (delay <= step.clamp(max=self.max_delay))).nonzero(as_tuple=True)
         if used[0].numel():
             place = (*used[:-1], self.max_delay - delay[used])

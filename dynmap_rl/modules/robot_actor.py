@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 
 import numpy as np
@@ -9,6 +10,8 @@ import torch
 from tensordict import TensorDict
 
 from .delayed_actor import DelayedActor
+
+LATE = 0.75  # part of a period by which a call may be late without a missed step
 
 
 class RobotActor:
@@ -23,41 +26,74 @@ class RobotActor:
 
     The episode begins with the first call of :meth:`act`, which needs a frame. The robot is at rest before it, so that
     the newest frame then counts as the frame of that moment. Every later frame belongs to the call of :meth:`act` that is
-    nearest to its timestamp; frames older than ``max_delay`` steps are not used. Where a call comes so late that control
-    steps were missed, these count as steps with an action of zero; after a longer gap than ``max_delay`` steps, the robot
-    is at rest, and only the last ``max_delay`` of them count.
+    nearest to its timestamp, and of several frames that arrive together for a call, the nearest is used; frames older
+    than ``max_delay`` steps are not used.
+
+    A call may be late by up to three quarters of a period. Where it is later, control steps were missed, which count as
+    steps with an action of zero; after a longer gap than ``max_delay`` steps, the robot is at rest, and only the last
+    ``max_delay`` of them count.
 
     Args:
-        actor: world model and policy.
+        actor: world model and policy; its ``max_delay`` is the age of the oldest frames that are used.
         period: duration of a control step, in the unit of the timestamps (s).
+
+    Raises:
+        ValueError: ``period`` is not positive, or ``max_delay`` is 0, so that no late frame would be used.
     """
 
     def __init__(self, actor: DelayedActor, period: float = 0.05):
+        if actor.max_delay < 1:
+            raise ValueError(
+                "actor must have a max_delay of at least 1 step; give DelayedActor max_delay=..."
+            )
+        if not period > 0:
+            raise ValueError(f"period must be positive, got {period}")
         self.actor, self.period = actor.eval(), period
         self.device = next(actor.parameters()).device
+        self.goal = None
 
-    def reset(self, goal: np.ndarray) -> None:
-        """Forget everything and take a new goal, ``[G]`` (SI units)."""
+    def reset(self, goal: np.ndarray, since: float = -math.inf) -> None:
+        """Forget everything and take a new goal.
+
+        Args:
+            goal: ``[G]`` (SI units).
+            since: time from which on frames are of the new episode; frames that were taken before it are not used.
+        """
         self.goal = torch.as_tensor(goal, dtype=torch.float32, device=self.device)
-        self.memory = TensorDict({}, device=self.device)
+        self.since, self.memory = since, TensorDict({}, device=self.device)
         self.frames: list[tuple[float, np.ndarray]] = []
         self.times: deque[float] = deque(maxlen=self.actor.max_delay + 1)  # of the last steps
 
     def observe(self, frame: np.ndarray, timestamp: float) -> None:
-        """Take a frame, uint8 ``[64, 64, 3]``, and the time at which it was taken."""
-        self.frames.append((timestamp, frame))
+        """Take a frame, uint8 ``[64, 64, 3]``, and the time at which it was taken.
+
+        Raises:
+            ValueError: the frame is not uint8 ``[H, W, 3]``, or the time is not finite.
+        """
+        frame = np.array(frame)  # a camera may use its buffer again
+        if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[-1] != 3:
+            raise ValueError(f"frame must be uint8 [H, W, 3], got {frame.dtype} {list(frame.shape)}")
+        if not math.isfinite(timestamp):
+            raise ValueError(f"timestamp must be finite, got {timestamp}")
+        self._check_reset()
+        if timestamp >= self.since:
+            self.frames.append((timestamp, frame))
 
     @torch.no_grad()
     def act(self, now: float) -> np.ndarray:
         """Return the action of the control step that begins now, float32 ``[A]`` (SI units).
 
         Raises:
-            ValueError: no frame has arrived before the first action.
+            ValueError: no frame has arrived before the first action, or ``now`` is not after the last call.
         """
+        self._check_reset()
+        if self.times and not now > self.times[-1]:
+            raise ValueError(f"now must be after the last call at {self.times[-1]}, got {now}")
         if self.times:
             self._miss_steps(now)
         elif self.frames:
             self.frames = [(now, max(self.frames, key=lambda pair: pair[0])[1])]
+            self.step, self.start = 0, now
         else:
             raise ValueError("the first action needs a frame; call observe before act")
         self.times.append(now)
@@ -65,26 +101,41 @@ class RobotActor:
         self.memory = td["next"]
         return td[self.actor.actor.action].cpu().numpy()
 
+    def _check_reset(self) -> None:
+        if self.goal is None:
+            raise ValueError("an episode needs a goal; call reset first")
+
     def _receive(self) -> TensorDict:
         """Return memory, goal, and the frames that have arrived since the last step."""
         td, keys = self.memory.copy().set(self.actor.actor.latent_actor.goal, self.goal), self.actor.actor
         frames, self.frames = self.frames, []
-        if frames:
-            pixels = torch.from_numpy(np.stack([frame for _, frame in frames])).movedim(-1, -3)
-            delays = torch.tensor([self._delay(timestamp) for timestamp, _ in frames])
-            td.set(keys.pixels, pixels).set(self.actor.delay_key, delays)
+        nearest = {}  # frame by its delay
+        for timestamp, frame in frames:
+            delay, distance = self._delay(timestamp)
+            if delay not in nearest or distance < nearest[delay][0]:
+                nearest[delay] = distance, frame
+        if nearest:
+            pixels = torch.from_numpy(np.stack([frame for _, frame in nearest.values()])).movedim(-1, -3)
+            td.set(keys.pixels, pixels).set(self.actor.delay_key, torch.tensor([*nearest]))
         return td
 
-    def _delay(self, timestamp: float) -> int:
-        """Return the steps from a timestamp to the present; -1 for times before all remembered steps."""
-        if timestamp < self.times[0] - self.period / 2:
-            return -1
-        return min(range(len(self.times)), key=lambda steps: abs(self.times[-1 - steps] - timestamp))
+    def _delay(self, timestamp: float) -> tuple[int, float]:
+        """Return the steps from a timestamp to the present, and how far it is from its step.
+
+        The steps are -1 for times before all remembered steps.
+        """
+        distances = [abs(time - timestamp) for time in reversed(self.times)]
+        steps = min(range(len(distances)), key=distances.__getitem__)
+        return -1 if timestamp < self.times[0] - self.period / 2 else steps, distances[steps]
 
     def _miss_steps(self, now: float) -> None:
-        """Predict the control steps without an action since the last call."""
+        """Predict the control steps without an action since the last call.
+
+        They are counted on the beat that began with the episode: counted from call to call, a call that is late and one
+        that is early again would be three steps.
+        """
         last = self.times[-1]
-        steps = round((now - last) / self.period)
+        steps = max(1, math.floor((now - self.start) / self.period + 1 - LATE) - self.step)
         for i in range(max(1, steps - self.actor.max_delay), steps):
             self.times.append(last + i * (now - last) / steps)
             td = self.actor.observe(self.memory.copy())
@@ -92,3 +143,6 @@ class RobotActor:
             td = self.actor.predict(td.set(self.actor.actor.action, torch.zeros(size)))
             # Without an action, the policy's memory stays as it is.
             self.memory.update(td["next"])
+        self.step += steps
+        # The beat is that of the earliest calls.
+        self.start = min(self.start, now - (self.step - 1 + LATE) * self.period)

@@ -51,13 +51,26 @@ def read_delays(folder: Path) -> list[dict]:
     return sorted(results, key=place)
 
 
+def list_delayed_runs(results: list[dict]) -> list[str]:
+    """Return the runs of some results, each once, in their order; the table has their numbers, from 1."""
+    return list(dict.fromkeys(result["run"] for result in results))
+
+
+def find_training(folder: Path) -> dict[str, str]:
+    """Return command and commit of the training of a run; empty where it has no ``eval.json``."""
+    path = folder / "eval.json"
+    found = read_json(path) if path.exists() else {}
+    return {name: found[name] for name in ("command", "commit") if name in found}
+
+
 def delay_table(results: list[dict]) -> str:
     """Return SR (%) with 95 % Wilson intervals as a table in Markdown: a line for each run and condition."""
     cells_by_time = [
         {_milliseconds(result, steps): c for steps, c in result["cells"].items()} for result in results
     ]
     times = sorted(set().union(*cells_by_time))
-    header = ["task", "world model", "policy", "condition", *(f"{time} ms" for time in times)]
+    runs = list_delayed_runs(results)
+    header = ["task", "world model", "policy", "run", "condition", *(f"{time} ms" for time in times)]
     lines = []
     for result, found in zip(results, cells_by_time, strict=True):
         cells = [found.get(time) for time in times]
@@ -65,7 +78,8 @@ def delay_table(results: list[dict]) -> str:
             f"**{c['SR']:.1f}** [{c['SR_interval'][0]:.1f}, {c['SR_interval'][1]:.1f}]" if c else ""
             for c in cells
         ]
-        lines.append([result["task"], result["row"], result["policy"], condition_text(result), *values])
+        names = [result[name] for name in ("task", "row", "policy")]
+        lines.append([*names, str(runs.index(result["run"]) + 1), condition_text(result), *values])
     return join_table(header, lines)
 
 
@@ -74,6 +88,11 @@ def delay_page(results: list[dict]) -> str:
     sizes = sorted({(result["split"], result["episodes"]) for result in results})
     scenes = ", ".join(f"{count} scenes of the split {split}" for split, count in sizes)
     commands = sorted({cell["command"] for result in results for cell in result["cells"].values()})
+    trained = {result["run"]: result.get("trained") or {} for result in results}
+    runs = [
+        f"{number}. `{run}`" + (f": `{trained[run]['command']}`" if "command" in trained[run] else "")
+        for number, run in enumerate(list_delayed_runs(results), 1)
+    ]
     return "\n".join(
         [
             "# Success against the delay of the frames",
@@ -82,11 +101,18 @@ def delay_page(results: list[dict]) -> str:
             "",
             "Frames are late, and the goal is not. With `rolled forward`, the world model predicts the steps from the newest",
             "frame to the present; with `stale frames`, the policy treats the newest frame as the present one. The policy with",
-            "past actions reads the newest frame and the actions sent since, and was trained for delays of 0 to 30 steps alike,",
-            "so that a frame without actions after it is rare in its training. Policies of LeRobot also read the commanded",
-            "pose of the cart, which is not late, so that their rows and ours are no comparison on the same inputs.",
+            "past actions reads the newest frame and the actions sent since; it was trained for delays of 0 to 30 steps alike,",
+            "and has no actions to read at 0 ms only. Policies of LeRobot also read the commanded pose of the cart, which is",
+            "not late, so that their rows and ours are no comparison on the same inputs. Every row is one world model and one",
+            "policy.",
             "",
             delay_table(results),
+            "",
+            "Runs, with the commands that trained them:",
+            "",
+            *runs,
+            "",
+            "Commands of the measurements:",
             "",
             "```bash",
             *commands,
@@ -165,8 +191,8 @@ def _dots(results: list[dict]) -> dict[str, dict[str, dict[str, dict]]]:
 
 
 def _drop_rare(panel: dict[str, dict[str, dict]]) -> dict[str, dict[str, dict]]:
-    """Return the panel without the markers of a single line, which nothing is compared with."""
-    count = Counter(name for cells in panel.values() for name in cells)
+    """Return the panel without the delays of a single line, which nothing is compared with."""
+    count = Counter(name for cells in panel.values() for name in cells) + Counter({"no delay": 1})
     kept = {line: {name: c for name, c in cells.items() if count[name] > 1} for line, cells in panel.items()}
     return {line: cells for line, cells in kept.items() if cells}
 
@@ -179,7 +205,7 @@ def _draw_lines(axis, lines: dict[str, dict]) -> None:
         style = "--" if CONDITIONS[result["condition"]][3] else "-"
         time = [_milliseconds(result, step) for step in steps]
         axis.errorbar(time, rates, errors, ls=style, lw=1.4, elinewidth=1, capsize=2, marker=".", label=label)
-    axis.set_title("success against the delay of the frames", fontsize=8)
+    axis.set_title("balance_reaching: success against the delay of the frames", fontsize=8)
     axis.set_xlabel("delay of the frames [ms]", fontsize=8)
     axis.set_ylabel("success [%]", fontsize=8)
     axis.legend(fontsize=6, loc="upper center", bbox_to_anchor=(0.5, -0.16))

@@ -127,7 +127,7 @@ def has_world_model(folder: Path) -> bool:
 def evaluate_cell(config: Config, path: Path, result: dict, steps: int) -> None:
     """Evaluate a run under a condition with one delay, and add the cell to the file."""
     from dynmap_rl.evaluation.protocol import evaluate
-    from dynmap_rl.paper.delays import CONDITIONS, frame_delay
+    from dynmap_rl.paper.delays import CONDITIONS, find_training, frame_delay
     from dynmap_rl.runs.lookup import find_run
     from dynmap_rl.utils.files import write_json
     from dynmap_rl.utils.version import find_commit
@@ -139,7 +139,7 @@ def evaluate_cell(config: Config, path: Path, result: dict, steps: int) -> None:
     found = evaluate(actor, result["task"], config.eval, delay, pushed, workers)["test"]
     cell = {name: found["summary"][name] for name in ("SR", "SR_interval", "DR", "DR_interval", "PE")}
     cell |= {"success": found["rows"]["success"], "command": command_line(sys.argv), "commit": find_commit()}
-    result |= names
+    result |= names | {"trained": find_training(find_run(result["run"]))}
     result["cells"][str(steps)] = cell
     write_json(path, result)
     print(f"    SR {cell['SR']:.1f} %   DR {cell['DR']:.1f} %   PE {cell['PE']:.1f} mm", flush=True)

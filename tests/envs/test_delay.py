@@ -35,6 +35,21 @@ class Counter(gym.Env):
         return np.array([self.count]), 0.0, False, False, {}
 
 
+def test_an_environment_may_use_its_buffer_again():
+    class Buffered(Counter):
+        def reset(self, **arguments):
+            self.buffer, _ = super().reset(**arguments)
+            return self.buffer, {}
+
+        def step(self, action):
+            self.buffer[:] = super().step(action)[0]
+            return self.buffer, 0.0, False, False, {}
+
+    env = DelayFrames(Buffered(), FrameDelay(2))
+    env.reset(seed=0)
+    assert [env.step(0)[0].item() for _ in range(4)] == [0, 0, 1, 2]
+
+
 def play(delay, seed=0):
     """Return, for each step, the frame in the observation, its delay, and the frames that arrive by their delay."""
     env = DelayFrames(Counter(), delay)
@@ -155,7 +170,9 @@ def test_a_robot_s_actor_in_the_wrapper_without_delay_is_the_actor():
         ({"steps": -1}, "steps must be at least 0, got -1"),
         ({"steps": 1, "jitter": 2}, "jitter must be at most the delay of 1 steps, got 2"),
         ({"lost": 1.5}, "lost must be a probability, 0 to 1, got 1.5"),
-        ({"lost": -0.5}, "lost must be at least 0, got -0.5"),
+        ({"lost": -0.5}, "lost must be a probability, 0 to 1, got -0.5"),
+        ({"lost": float("nan")}, "lost must be a probability"),
+        ({"steps": 1.5}, "steps must be a whole number"),
     ],
 )
 def test_settings_are_checked(settings, message):

@@ -251,3 +251,22 @@ def test_gradients_pass_through_the_imagined_steps():
 def test_bad_delays_are_refused(arguments):
     with pytest.raises(ValueError, match="delay must be between 0 and max_delay"):
         DelayedActor(make_actor(), *arguments)
+
+
+@pytest.mark.parametrize(
+    ("frames", "delays"), [((2, 5), (2, 1)), ((2,), (2, 5)), ((2, 5), None)], ids=["few", "many", "none"]
+)
+def test_every_frame_needs_a_delay(frames, delays):
+    td = TensorDict({"goal": GOAL, "pixels": torch.zeros(*frames, 3, 64, 64, dtype=torch.uint8)}, [2])
+    if delays:
+        td["delay"] = torch.zeros(delays, dtype=torch.int64)
+    with pytest.raises(ValueError, match="a delay for each frame"):
+        DelayedActor(make_actor(), max_delay=3)(td)
+
+
+def test_delays_are_whole_steps():
+    td = TensorDict({"goal": GOAL, "pixels": torch.zeros(2, 3, 64, 64, dtype=torch.uint8)}, [2])
+    with pytest.raises(ValueError, match="int64"):
+        DelayedActor(make_actor(), max_delay=3)(td.set("delay", torch.zeros(2, 1)))
+    with pytest.raises(ValueError, match="whole"):
+        DelayedActor(make_actor(), delay=1.5)

@@ -121,3 +121,76 @@ def test_reset_forgets_the_episode_and_takes_a_goal():
     robot.reset(GOAL)
     with pytest.raises(ValueError, match="call observe before act"):
         robot.act(2.0)
+
+
+@pytest.mark.parametrize("late", [0.02, 0.03, 0.035])
+def test_a_late_call_and_a_punctual_one_after_it_are_two_steps(late):
+    robot, regular = make_robot(), make_robot()
+    for t in range(9):
+        now = t * DT + late * (t % 2)
+        robot.observe(FRAMES[t], now)
+        regular.observe(FRAMES[t], t * DT)
+        np.testing.assert_array_equal(robot.act(now), regular.act(t * DT))
+    assert robot.step == 8
+
+
+@pytest.mark.parametrize("period", [0.02, 0.049, 0.06, 0.076, 0.12])
+def test_calls_at_another_rate_count_the_time(period):
+    robot = make_robot()
+    robot.observe(FRAMES[0], 0.0)
+    times = np.arange(30) * period
+    for now in times:
+        robot.act(now)
+    assert robot.step == pytest.approx(max(29, times[-1] / DT), abs=1)
+
+
+def test_frames_of_the_last_episode_are_not_used():
+    robot = make_robot()
+    robot.observe(FRAMES[3], 1.0)
+    first = robot.act(1.0)
+    robot.reset(GOAL, since=2.0)
+    robot.observe(FRAMES[5], 1.9)
+    with pytest.raises(ValueError, match="observe"):
+        robot.act(2.0)
+    robot.observe(FRAMES[3], 2.0)
+    np.testing.assert_array_equal(robot.act(2.05), first)
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_the_frame_nearest_to_a_call_is_its_frame(order):
+    robot = make_robot()
+    robot.observe(FRAMES[0], 0.0)
+    robot.act(0.0)
+    robot.act(0.05)
+    for frame, time in [(FRAMES[1], 0.051), (FRAMES[9], 0.066)][::order]:
+        robot.observe(frame, time)
+    np.testing.assert_array_equal(robot.act(0.1), run_in_steps([[0], [], [1]])[-1])
+
+
+def test_a_camera_may_use_its_buffer_again():
+    robot, buffer = make_robot(), FRAMES[0].copy()
+    robot.observe(buffer, 0.0)
+    buffer[:] = 0
+    np.testing.assert_array_equal(robot.act(0.0), run_in_steps([[0]])[0])
+
+
+def test_wrong_use_gets_one_clear_error():
+    robot = RobotActor(make_actor())
+    with pytest.raises(ValueError, match="reset"):
+        robot.observe(FRAMES[0], 0.0)
+    with pytest.raises(ValueError, match="reset"):
+        robot.act(0.0)
+    robot.reset(GOAL)
+    with pytest.raises(ValueError, match="uint8"):
+        robot.observe(FRAMES[0] / 255, 0.0)
+    with pytest.raises(ValueError, match="timestamp"):
+        robot.observe(FRAMES[0], float("nan"))
+    robot.observe(FRAMES[0], 0.0)
+    robot.act(5.0)
+    for now in (5.0, 0.0, float("nan")):
+        with pytest.raises(ValueError, match="after the last call"):
+            robot.act(now)
+    with pytest.raises(ValueError, match="max_delay"):
+        RobotActor(make_actor(max_delay=0))
+    with pytest.raises(ValueError, match="period"):
+        RobotActor(make_actor(), period=0)

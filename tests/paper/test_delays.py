@@ -15,19 +15,20 @@ def make_results(folder):
             for d, rate in rates.items()
         }
         facts = {"task": "balance_reaching", "row": "RGB+[P]", "policy": "recurrent", "condition": condition}
-        facts |= {"split": "test", "episodes": 50}
+        facts |= {"split": "test", "episodes": 50, "run": "runs/some", "trained": {"command": "python train"}}
         write_json(folder / f"{condition}.json", facts | {"cells": cells})
     return delays.read_delays(folder)
 
 
 def test_the_table_has_a_line_for_each_condition_and_a_column_for_each_delay(tmp_path):
     lines = delays.delay_table(make_results(tmp_path)).splitlines()
-    assert [cell.strip() for cell in lines[0].split("|")[5:-1]] == ["0 ms", "500 ms", "1500 ms"]
-    stale, imagined = ([cell.strip() for cell in line.split("|")[5:-1]] for line in lines[2:])
+    assert [cell.strip() for cell in lines[0].split("|")[6:-1]] == ["0 ms", "500 ms", "1500 ms"]
+    stale, imagined = ([cell.strip() for cell in line.split("|")[6:-1]] for line in lines[2:])
     assert stale == ["**99.0** [98.0, 100.0]", "**5.0** [4.0, 6.0]", "**0.0** [-1.0, 1.0]"]
     assert imagined == ["**99.0** [98.0, 100.0]", "**95.0** [94.0, 96.0]", ""]
     page = delays.delay_page(make_results(tmp_path))
     assert "python imagined 0\npython imagined 10" in page and "50 scenes" in page
+    assert "1. `runs/some`: `python train`" in page
 
 
 def test_long_results_are_lines_and_others_are_dots_of_supervisions_and_conditions(tmp_path, monkeypatch):
