@@ -16,18 +16,22 @@ from .source_results import (
 )
 from .tables import join_table
 
+FORMS = {"glimpse": "the default encoder and decoder", "plain": "the paper's plain CNN"}
 
-def write_source_page(results: Path, tasks: list[str]) -> list[Path]:
+
+def write_source_page(results: Path, tasks: list[str], architecture: str = "glimpse") -> list[Path]:
     """Write ``README.md`` and the figures into the folder of the results; return the files.
 
     Args:
         results: folder of the results.
         tasks: names of the tasks, as in the names of the cells.
+        architecture: form of the world models.
     """
     parts = [
         "# Sources of dynamics, and numbers of demonstrations",
-        "SR in % with 95 % intervals over world models and policies on the shared start states. The share of the gain is "
-        "that of the simulator's dynamics over Only-RGB. Measures are means over world models. Written by "
+        f"World models have {FORMS[architecture]}. SR in % with 95 % intervals over world models and policies on the "
+        "shared start states; with one world model, the interval does not know how much world models differ. The share "
+        "of the gain is that of the simulator's dynamics over Only-RGB. Measures are means over world models. Written by "
         "`recipes/paper/sources.py --write`.",
     ]
     written = []

@@ -20,6 +20,7 @@ from .sources import DATA_ROWS, POLICIES, SIZES, SOURCES, WORLD_MODELS, cell_nam
 from .tables import join_table
 
 CONTEXT, HORIZON = 20, 40  # steps with frames, and then without
+FEWEST = 5  # sources of a rank correlation
 MEASURES = {  # name: text, and the sign with which it should rise with success
     "probe_position": ("R^2 of a linear map to the positions", 1),
     "probe_velocity": ("R^2 of a linear map to the velocities", 1),
@@ -145,12 +146,15 @@ def data_table(results: Path, task: str) -> str:
 
 
 def rank_correlations(results: Path, task: str) -> dict[str, dict[str, float]]:
-    """Return Spearman's rank correlation of each measure with SR over the sources, by policy, with its p and number."""
+    """Return Spearman's rank correlation of each measure with SR, by policy, with its p and the number of sources.
+
+    There is none of less than five sources.
+    """
     correlations = {}
     for policy in POLICIES:
         for name in MEASURES:
             x, y, _ = measured_points(results, task, policy, name)
-            if len(x) > 2:
+            if len(x) >= FEWEST:
                 found = spearmanr(x, y)
                 numbers = {"rho": float(found.statistic), "p": float(found.pvalue), "sources": len(x)}
                 correlations[f"{policy}, {name}"] = numbers
@@ -217,7 +221,7 @@ def plot_measures(results: Path, task: str, path: Path) -> None:
             label = policy if rho is None else f"{policy}, rank correlation {rho:.2f}"
             axis.plot(x, y, marker, ms=4, label=label)
             for place in zip(x, y, names, strict=True) if policy == "recurrent" else ():
-                axis.annotate(place[2], place[:2], fontsize=5)
+                axis.annotate(place[2], place[:2], fontsize=7)
         axis.set_xlabel(text, fontsize=8)
         axis.grid(alpha=0.3)
         axis.legend(fontsize=7)

@@ -156,7 +156,11 @@ def write(config: Config) -> None:
     tasks = [get_task(task).name for task in config.tasks.split(",")]
     if not any(config.results.glob("*.json")):
         raise ValueError(f"{config.results} must have results; run recipes/paper/sources.py first")
-    print("\n".join(f"written: {path}" for path in write_source_page(config.results, tasks)))
+    print(
+        "\n".join(
+            f"written: {path}" for path in write_source_page(config.results, tasks, config.architecture)
+        )
+    )
 
 
 if __name__ == "__main__":

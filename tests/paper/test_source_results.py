@@ -40,10 +40,10 @@ def test_the_open_loop_error_is_that_of_the_step_after_the_horizon(short):
 
 
 def test_rank_correlations_are_over_the_sources(tmp_path):
-    flags = {"dropped": "0000", "touched": "0000", "first_scene_seed": 0, "position_error": [0.01] * 4}
-    for count, source in enumerate(("none", "tracks", "flow", "simulator")):
+    flags = {"dropped": "00000", "touched": "00000", "first_scene_seed": 0, "position_error": [0.01] * 5}
+    for count, source in enumerate(("none", "tracks", "flow", "command", "simulator")):
         name = f"balance_reaching_{source}_world_model_0_recurrent.json"
-        rows = flags | {"success": "1" * count + "0" * (4 - count)}
+        rows = flags | {"success": "1" * count + "0" * (5 - count)}
         write_json(tmp_path / name, {"results": [{"test": {"rows": rows}}], "command": "python x.py"})
         measures = {
             "probe_position": count**2,
@@ -51,6 +51,8 @@ def test_rank_correlations_are_over_the_sources(tmp_path):
             "open_loop_mm": 10.0 / (1 + count),
         }
         write_json(tmp_path / "measures" / name, measures)
+        if count == 3:
+            assert rank_correlations(tmp_path, "balance_reaching") == {}, "four sources are too few"
     found = rank_correlations(tmp_path, "balance_reaching")
     rho = {name: row["rho"] for name, row in found.items()}
     assert rho == {
