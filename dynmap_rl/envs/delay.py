@@ -71,12 +71,20 @@ class DelayFrames(gym.Wrapper, gym.utils.RecordConstructorArgs):
         env: environment whose observations are frames, or dicts with a frame.
         delay: how frames arrive.
         key: name of the frame in a dict of observations.
+
+    Raises:
+        ValueError: ``delay`` is no :class:`FrameDelay`, or the observations have no ``key``.
     """
 
     def __init__(self, env: gym.Env, delay: FrameDelay, key: str = "pixels"):
         gym.utils.RecordConstructorArgs.__init__(self, delay=delay, key=key)
         gym.Wrapper.__init__(self, env)
-        self.delay, self.key = delay, key if isinstance(env.observation_space, gym.spaces.Dict) else None
+        if not isinstance(delay, FrameDelay):
+            raise ValueError(f"delay must be a FrameDelay, such as FrameDelay(steps=6), got {delay!r}")
+        space = env.observation_space
+        if isinstance(space, gym.spaces.Dict) and key not in space.spaces:
+            raise ValueError(f"key must be one of {', '.join(space.spaces)}, got {key!r}")
+        self.delay, self.key = delay, key if isinstance(space, gym.spaces.Dict) else None
         self._generator = make_generator(None)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):

@@ -50,6 +50,15 @@ def test_an_environment_may_use_its_buffer_again():
     assert [env.step(0)[0].item() for _ in range(4)] == [0, 0, 1, 2]
 
 
+def test_the_wrapper_needs_a_delay_and_a_frame():
+    with pytest.raises(ValueError, match="FrameDelay"):
+        DelayFrames(Counter(), 6)
+    env = Counter()
+    env.observation_space = gym.spaces.Dict(frame=Counter.observation_space)
+    with pytest.raises(ValueError, match="one of frame, got 'pixels'"):
+        DelayFrames(env, FrameDelay(6))
+
+
 def play(delay, seed=0):
     """Return, for each step, the frame in the observation, its delay, and the frames that arrive by their delay."""
     env = DelayFrames(Counter(), delay)
