@@ -40,13 +40,14 @@ def frame_delay(condition: str, steps: int) -> FrameDelay | None:
 
 
 def read_delays(folder: Path) -> list[dict]:
-    """Read the results of ``recipes/paper/delays.py``, sorted by task, supervision, policy and condition."""
+    """Read the results of ``recipes/paper/delays.py``, sorted by task, supervision, policy, run and condition."""
     results = [read_json(path) for path in sorted(folder.glob("*.json"))]
     rows, conditions = {row: index for index, row in enumerate(ROWS)}, list(CONDITIONS)
 
     def place(result: dict) -> tuple:
         row = rows.get(result["row"], len(rows))  # policies of LeRobot come last
-        return result["task"], row, result["row"], result["policy"], conditions.index(result["condition"])
+        names = (result[name] for name in ("row", "policy", "run"))
+        return result["task"], row, *names, conditions.index(result["condition"])
 
     return sorted(results, key=place)
 
@@ -126,8 +127,8 @@ def plot_delays(results: list[dict], path: Path) -> None:
     """Draw success with its intervals: lines against the delay, and dots for what was measured at a few delays.
 
     Results with more than four delays are lines in the first panel. The other panels have a line of dots for each
-    supervision and policy of a task, on stale frames and rolled forward, or for each condition. A panel with less than
-    two lines is left out.
+    supervision and policy of a task, on stale frames and rolled forward, or for each condition; of several runs of a
+    supervision, a dot is of the last one. A panel with less than two lines is left out.
 
     Args:
         results: see :func:`read_delays`.
