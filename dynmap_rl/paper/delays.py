@@ -89,11 +89,10 @@ def delay_page(results: list[dict]) -> str:
     sizes = sorted({(result["split"], result["episodes"]) for result in results})
     scenes = ", ".join(f"{count} scenes of the split {split}" for split, count in sizes)
     commands = sorted({cell["command"] for result in results for cell in result["cells"].values()})
-    trained = {result["run"]: result.get("trained") or {} for result in results}
-    runs = [
-        f"{number}. `{run}`" + (f": `{trained[run]['command']}`" if "command" in trained[run] else "")
-        for number, run in enumerate(list_delayed_runs(results), 1)
-    ]
+    trained = {
+        result["run"]: result["trained"].get("command", "ships with the package") for result in results
+    }
+    runs = [f"{i}. `{run}`: `{trained[run]}`" for i, run in enumerate(list_delayed_runs(results), 1)]
     return "\n".join(
         [
             "# Success against the delay of the frames",
@@ -193,7 +192,8 @@ def _dots(results: list[dict]) -> dict[str, dict[str, dict[str, dict]]]:
 
 def _drop_rare(panel: dict[str, dict[str, dict]]) -> dict[str, dict[str, dict]]:
     """Return the panel without the delays of a single line, which nothing is compared with."""
-    count = Counter(name for cells in panel.values() for name in cells) + Counter({"no delay": 1})
+    count = Counter(name for cells in panel.values() for name in cells)
+    count["no delay"] += 1  # is what all delays are compared with
     kept = {line: {name: c for name, c in cells.items() if count[name] > 1} for line, cells in panel.items()}
     return {line: cells for line, cells in kept.items() if cells}
 
@@ -206,7 +206,8 @@ def _draw_lines(axis, lines: dict[str, dict]) -> None:
         style = "--" if CONDITIONS[result["condition"]][3] else "-"
         time = [_milliseconds(result, step) for step in steps]
         axis.errorbar(time, rates, errors, ls=style, lw=1.4, elinewidth=1, capsize=2, marker=".", label=label)
-    axis.set_title("balance_reaching: success against the delay of the frames", fontsize=8)
+    tasks = ", ".join(dict.fromkeys(result["task"] for result in lines.values()))
+    axis.set_title(f"{tasks}: success against the delay of the frames", fontsize=8)
     axis.set_xlabel("delay of the frames [ms]", fontsize=8)
     axis.set_ylabel("success [%]", fontsize=8)
     axis.legend(fontsize=6, loc="upper center", bbox_to_anchor=(0.5, -0.16))

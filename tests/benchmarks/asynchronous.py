@@ -4,9 +4,10 @@
 
 The server, in a process of its own, takes ``--latency`` seconds for a chunk (LeRobot's ``--inference_latency``). The
 robot is the Gymnasium environment, which takes a control step every 50 ms. Episodes are in real time, so that a busy
-machine delays frames even more. Every scene is played with ``--policy.delay`` and with ``--policy.delay=0``, where the
-actions that the robot executes while a chunk is on its way are not part of the chunk. Success without a delay is that of the same scenes in simulated time. Writes
-``recipes/results/measurements/asynchronous.json``, after every episode; a second call goes on.
+machine delays frames even more. Every scene is played with ``--policy.delay`` and with ``--policy.delay=0``, where a
+chunk does not begin with the actions that the robot executes while it is on its way. Success without a delay is that of
+the same scenes in simulated time. Writes ``recipes/results/measurements/asynchronous.json``, after every episode; a
+second call goes on.
 """
 
 from __future__ import annotations
