@@ -89,10 +89,11 @@ def delay_page(results: list[dict]) -> str:
     sizes = sorted({(result["split"], result["episodes"]) for result in results})
     scenes = ", ".join(f"{count} scenes of the split {split}" for split, count in sizes)
     commands = sorted({cell["command"] for result in results for cell in result["cells"].values()})
-    trained = {
-        result["run"]: result["trained"].get("command", "ships with the package") for result in results
-    }
-    runs = [f"{i}. `{run}`: `{trained[run]}`" for i, run in enumerate(list_delayed_runs(results), 1)]
+    trained = {result["run"]: result["trained"].get("command") for result in results}
+    runs = [
+        f"{i}. `{run}`: " + (f"`{trained[run]}`" if trained[run] else "ships with the package")
+        for i, run in enumerate(list_delayed_runs(results), 1)
+    ]
     return "\n".join(
         [
             "# Success against the delay of the frames",
