@@ -96,6 +96,7 @@ def judge_policy(config: Config) -> tuple[Path, str, dict]:
     """Return the folder with an animation, the numbers as text, and the result with the outcome of every episode."""
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.evaluation.protocol import evaluate
+    from dynmap_rl.evaluation.statistics import summary_text
     from dynmap_rl.modules.actor import Actor
     from dynmap_rl.modules.delayed_actor import DelayedActor
     from dynmap_rl.reporting.media import film_policy
@@ -111,16 +112,13 @@ def judge_policy(config: Config) -> tuple[Path, str, dict]:
         actor = DelayedActor(actor, max_delay=delay.longest)
     workers = config.compute.threads if isinstance(actor, Actor | DelayedActor) else 1
     result = evaluate(actor, task, config.eval, delay, workers=workers)["test"]
-    summary = result["summary"]
-    low, high = summary["SR_interval"]
-    text = f"DR {summary['DR']:.1f} %   PE {summary['PE']:.1f} mm   SR {summary['SR']:.1f} % [{low:.1f}, {high:.1f}]"
     parts = [*Path(config.policy).parts[-4:], f"seed_{config.seed}"]
     if delay:
         parts += ["_".join(map(str, ["delay", *astuple(delay)])), *(["stale"] if config.stale else [])]
         result |= {"delay": asdict(delay), "stale": config.stale}
     folder = name_folder(config, get_task(task).name, *parts)
     film_policy(actor, task, result["rows"], folder / "rollouts.gif", delay, config.failures)
-    return folder, text, {"task": task, "policy": config.policy, **result}
+    return folder, summary_text(result["summary"]), {"task": task, "policy": config.policy, **result}
 
 
 def read_delay(config: Config):

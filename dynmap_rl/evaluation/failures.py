@@ -6,16 +6,18 @@ import numpy as np
 from tensordict import TensorDictBase
 
 from dynmap_rl.envs.scene import BinRanges
-from dynmap_rl.envs.task import ROCKING
-from dynmap_rl.envs.tasks import REST_SPEED, SUCCESS_DISTANCE
+from dynmap_rl.envs.task import ROCKING, Task
+from dynmap_rl.envs.tasks import REST_SPEED, SUCCESS_DISTANCE, get_task
 
 CAUSES = (
     "drops at the start", "drops while accelerating", "drops while braking", "drops at the goal",
     "touches the obstacle", "still moves at the end", "stops short", "overshoots", "stops beside the goal",
     "keeps the block", "drops beside the bin", "in the bin, but touched or moving",
+    "loses the object", "hardly moves the object",
 )  # fmt: skip
 NEAR = SUCCESS_DISTANCE  # m, from start or goal
 LAST = 10  # steps, over which the position error is a mean
+MOVED = 0.01  # m
 
 
 def failure_causes(episodes: TensorDictBase, task: str) -> list[str | None]:
@@ -26,14 +28,18 @@ def failure_causes(episodes: TensorDictBase, task: str) -> list[str | None]:
     falls. In task 2, a touch before a drop is the cause. A cart that does not arrive is still moving if its mean speed in
     the last 10 steps exceeds 20 mm/s. Otherwise it stands before, behind or beside the goal, as seen from the start.
 
+    In tasks without cart and block, the object, which is the first body, is lost (it falls off the table), never moves
+    10 mm away from its start, or does not arrive, with the causes of a cart that does not.
+
     Args:
         episodes: result ``[E, T]`` of :func:`dynmap_rl.evaluation.roll_out`.
-        task: name of one of the three tasks.
+        task: name of the task.
 
     Returns:
         One of ``CAUSES``, or None for a success.
     """
-    find = _bin_cause if task == "bin_dropping" else _carrying_cause
+    find = _carrying_cause if isinstance(get_task(task), Task) else _moving_cause
+    find = _bin_cause if task == "bin_dropping" else find
     success = episodes["next", "is_success"][:, -1, 0].tolist()
     return [None if good else find(episode) for good, episode in zip(success, episodes, strict=True)]
 
@@ -69,7 +75,7 @@ def _drop_cause(episode: TensorDictBase, step: int) -> str:
 
 def _miss_cause(episode: TensorDictBase) -> str:
     position, velocity = (episode["dynamics", name][:, :2].numpy() for name in ("position", "velocity"))
-    goal = episode["goal"][0].numpy()
+    goal = episode["goal"][0, :2].numpy()
     if np.linalg.norm(velocity[-LAST:], axis=1).mean() > REST_SPEED:
         return "still moves at the end"
     way, offset = goal - position[0], position[-LAST:].mean(0) - goal
@@ -87,3 +93,12 @@ def _bin_cause(episode: TensorDictBase) -> str:
     x, y = (episode["dynamics", "position"][-1, 3:5] - episode["goal"][0]).tolist()
     inside = abs(x) < ranges.bin_width[1] / 2 and y > -ranges.bin_depth[1]
     return "in the bin, but touched or moving" if inside else "drops beside the bin"
+
+
+def _moving_cause(episode: TensorDictBase) -> str:
+    if bool(episode["next", "dropped"][-1]):
+        return "loses the object"
+    place = episode["dynamics", "position"][:, :3]
+    if float((place - place[0]).norm(dim=-1).max()) < MOVED:
+        return "hardly moves the object"
+    return _miss_cause(episode)

@@ -17,6 +17,7 @@ from dynmap_rl.modules.actor import Actor
 from dynmap_rl.modules.world_model import WorldModel
 from dynmap_rl.utils.processes import map_processes
 
+from .failures import failure_causes
 from .rollout import episode_rows, roll_out, scene_seeds
 from .settings import SHARED_STARTS, Evaluation
 from .statistics import summarize
@@ -59,7 +60,7 @@ def evaluate(
     if next(actor.parameters()).device.type == "cpu":
         rows = _judge_batches(actor, run, seeds, workers)
     else:
-        rows = episode_rows(run(actor, seeds=seeds), seeds)
+        rows = _judge_batch(lambda: actor, run, seeds, progress=True)
     parts = {"test": rows[: settings.episodes], "paper": rows[settings.episodes :]}
     return {
         name: {"summary": summarize(part), "rows": pack_rows(part)} for name, part in parts.items() if part
@@ -99,8 +100,13 @@ def _load_actor(actor: bytes) -> TensorDictModuleBase:
     return pickle.loads(actor)
 
 
-def _judge_batch(load: Callable[[], TensorDictModuleBase], run: partial, seeds: list[int]) -> list[dict]:
-    return episode_rows(run(load(), seeds=seeds, progress=False), seeds)
+def _judge_batch(
+    load: Callable[[], TensorDictModuleBase], run: partial, seeds: list[int], progress: bool = False
+) -> list[dict]:
+    episodes = run(load(), seeds=seeds, progress=progress)
+    causes = failure_causes(episodes, run.keywords["task"])
+    rows = zip(episode_rows(episodes, seeds), causes, strict=True)
+    return [row | ({"cause": cause} if cause else {}) for row, cause in rows]
 
 
 def judge_in_closed_loop(
@@ -117,21 +123,30 @@ def pack_rows(rows: list[dict]) -> dict:
         rows: see :func:`dynmap_rl.evaluation.episode_rows`.
 
     Returns:
-        ``first_scene_seed``, a text of 0 and 1 for each of ``success``, ``dropped`` and ``touched``, and the list
-        ``position_error`` (m).
+        ``first_scene_seed``, a text of 0 and 1 for each of ``success``, ``dropped`` and ``touched``, the list
+        ``position_error`` (m), and ``causes``, the indices of the failed episodes by cause.
     """
+    causes: dict[str, list[int]] = {}
+    for index, row in enumerate(rows):
+        if "cause" in row:
+            causes.setdefault(row["cause"], []).append(index)
     columns = {flag: "".join(str(int(row[flag])) for row in rows) for flag in FLAGS}
     errors = [round(row["position_error"], 4) for row in rows]
-    return {"first_scene_seed": rows[0]["scene_seed"], **columns, "position_error": errors}
+    first = rows[0]["scene_seed"]
+    return {"first_scene_seed": first, **columns, "position_error": errors, "causes": causes}
 
 
 def unpack_rows(columns: dict) -> list[dict]:
-    """Return the episode rows that :func:`pack_rows` packed."""
+    """Return the episode rows that :func:`pack_rows` packed; older results have no causes."""
     flags = [[flag == "1" for flag in columns[name]] for name in FLAGS]
     values = zip(*flags, columns["position_error"], strict=True)
     names = "scene_seed", *FLAGS, "position_error"
     first = columns["first_scene_seed"]
-    return [dict(zip(names, (first + i, *row), strict=True)) for i, row in enumerate(values)]
+    rows = [dict(zip(names, (first + i, *row), strict=True)) for i, row in enumerate(values)]
+    for cause, indices in columns.get("causes", {}).items():
+        for index in indices:
+            rows[index]["cause"] = cause
+    return rows
 
 
 def result_rows(result: dict) -> list[list[dict]]:

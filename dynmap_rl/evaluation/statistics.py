@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from statistics import NormalDist
 
@@ -10,7 +11,7 @@ import numpy as np
 # SciPy is imported where it is used: it takes a second, also in every process of an evaluation.
 
 
-def summarize(rows: list[dict]) -> dict[str, float]:
+def summarize(rows: list[dict]) -> dict:
     """Summarise episode rows (paper, Sec. V-B).
 
     Args:
@@ -18,8 +19,9 @@ def summarize(rows: list[dict]) -> dict[str, float]:
 
     Returns:
         ``DR`` and ``SR`` (%) with 95 % Wilson intervals for independent episodes, ``PE`` (mm), the number of
-        ``episodes`` and, where the rows have them, the share of episodes in which a wall was touched (``touched``, %)
-        and the errors of the predicted cart position (``localization``, ``localization_away``, mm).
+        ``episodes`` and, where the rows have them, the share of episodes in which a wall was touched (``touched``, %),
+        the errors of the predicted cart position (``localization``, ``localization_away``, mm) and the number of failed
+        episodes by cause (``causes``, the most frequent first).
     """
     count = len(rows)
     dropped = sum(row["dropped"] for row in rows)
@@ -37,7 +39,22 @@ def summarize(rows: list[dict]) -> dict[str, float]:
     if "localization_error" in rows[0]:
         summary["localization"] = 1000 * float(np.mean([row["localization_error"] for row in rows]))
         summary["localization_away"] = 1000 * float(np.mean([row["localization_error_away"] for row in rows]))
+    if causes := Counter(row["cause"] for row in rows if "cause" in row):
+        summary["causes"] = dict(causes.most_common())
     return summary
+
+
+def summary_text(summary: dict) -> str:
+    """Return a summary as a line of text, and another one for the failures by cause if there are any."""
+    low, high = summary["SR_interval"]
+    line = f"DR {summary['DR']:.1f} %   PE {summary['PE']:.1f} mm   SR {summary['SR']:.1f} % [{low:.1f}, {high:.1f}]"
+    return f"{line}\n{causes_text(summary)}".rstrip()
+
+
+def causes_text(summary: dict) -> str:
+    """Return the failures of a summary by cause as a line of text, such as ``failures: stops short 3``, or ""."""
+    counts = ", ".join(f"{cause} {count}" for cause, count in summary.get("causes", {}).items())
+    return f"failures: {counts}" if counts else ""
 
 
 def summarize_seeds(rows_by_seed: list[list[dict]]) -> dict[str, tuple[float, float]]:

@@ -1,9 +1,11 @@
-"""Cells of the grid of MuJoCo tasks, and its table."""
+"""Cells of the grid of MuJoCo tasks, and its tables."""
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 
+from dynmap_rl.evaluation.failures import CAUSES
 from dynmap_rl.evaluation.protocol import result_rows
 from dynmap_rl.evaluation.statistics import shared_interval, summarize
 from dynmap_rl.utils.files import read_json
@@ -17,10 +19,43 @@ METHODS = {  # by the row of the table: recipe and its options
     "Only-RGB": ("decoupled", ("--world_model.supervision", "none")),
     "RGB+[P]": ("decoupled", ("--world_model.supervision", "position")),
     "RGB+[P+V]": ("decoupled", ("--world_model.supervision", "position,velocity")),
+    "RGB+[P+V], ResNet-18": ("decoupled", ("--world_model.architecture", "resnet18")),
+    "RGB+[P+V], ViT": ("decoupled", ("--world_model.architecture", "vit")),
     "End-to-End": ("end_to_end", ()),
     "ACT": ("baseline", ("--policy", "act")),
     "Diffusion Policy": ("baseline", ("--policy", "diffusion")),
 }
+
+PAGE = """# MuJoCo tasks
+
+Success in % with 95 % intervals for the start states, which the seeds of a cell share; with one seed, the interval says
+nothing about further trainings. Tasks, cameras and experts are described in
+[dynmap_rl/envs/mujoco/README.md](../../../dynmap_rl/envs/mujoco/README.md). Written by
+`python recipes/paper/benchmarks3d.py --write` from the files in this folder.
+
+{table}
+
+Runs of code: {commits}.
+
+## What fails
+
+In % of the episodes. An object is lost when it falls off the table; one that is hardly moved stays within 10 mm of its
+start; one that stops short, overshoots or stops beside the goal does so as seen from its start.
+
+{failures}
+
+## Episodes
+
+Eight episodes of the first seed, the failed ones first, and at most four of these where as many succeed.
+
+{animations}
+
+## Commands
+
+```bash
+{commands}
+```
+"""
 
 
 def list_benchmarks(episodes: int = 500) -> dict[tuple[str, str, int], Run]:
@@ -40,7 +75,7 @@ def list_benchmarks(episodes: int = 500) -> dict[tuple[str, str, int], Run]:
 
 def name_run(task: str, method: str, seed: int) -> str:
     """Return the name of a run and of its result."""
-    words = method.lower().translate(str.maketrans("-+ ", "___", "[]"))
+    words = method.lower().translate(str.maketrans("-+ ", "___", "[],"))
     return f"{task.lower()}_{words}_seed_{seed}"
 
 
@@ -55,11 +90,12 @@ def read_benchmarks(results: Path) -> dict[tuple[str, str], list[dict]]:
 
 
 def benchmark_rows(results: Path) -> list[dict]:
-    """Return a row for each task and method: SR, PE and DR over the seeds, intervals, and the drops and failures.
+    """Return a row for each task and method: SR, PE and DR over the seeds, intervals, and failures by cause.
 
     Returns:
         Dicts with ``task``, ``method``, ``seeds``, ``episodes``, ``SR``, ``SR_interval``, ``DR``, ``DR_interval`` (%),
-        ``PE`` (mm), and ``commands``. Intervals count with start states that the seeds share.
+        ``PE`` (mm), ``rates`` (SR of each seed), ``causes`` (number of failed episodes by cause), ``commands`` and
+        ``commits``. Intervals count with start states that the seeds share.
 
     Raises:
         ValueError: the seeds of a row were evaluated on different scenes.
@@ -78,7 +114,10 @@ def benchmark_rows(results: Path) -> list[dict]:
                 **{name: summary[name] for name in ("episodes", "SR", "DR", "PE")},
                 "SR_interval": shared_interval(rows),
                 "DR_interval": shared_interval(rows, "dropped"),
+                "rates": [summarize(part)["SR"] for part in rows],
+                "causes": summary.get("causes", {}),
                 "commands": [cell["command"] for cell in cells],
+                "commits": [cell["commit"] for cell in cells],
             }
         )
     return table
@@ -95,6 +134,37 @@ def benchmark_table(rows: list[dict]) -> str:
             line.append(_describe(row) if row else "")
         lines.append(line)
     return join_table(["success %", *TASKS], lines)
+
+
+def failure_table(rows: list[dict]) -> str:
+    """Return the failed episodes by cause (% of the episodes) in Markdown: a line for each task and method."""
+    causes = sorted({cause for row in rows for cause in row["causes"]}, key=CAUSES.index)
+    lines = [
+        [
+            row["task"], row["method"], f"{100 - row['SR']:.1f}",
+            *(f"{100 * row['causes'].get(cause, 0) / row['episodes']:.1f}" for cause in causes),
+        ]
+        for row in rows
+    ]  # fmt: skip
+    return join_table(["% of the episodes", "", "fail", *causes], lines)
+
+
+def benchmark_page(rows: list[dict], folder: Path) -> str:
+    """Return the page of the results in Markdown, with the animations that are in the folder."""
+    animations = [
+        f"{row['task']}, {row['method']}:\n\n![Episodes, failures first]({name})"
+        for row in rows
+        if (folder / (name := f"{name_run(row['task'], row['method'], SEEDS[0])}.gif")).exists()
+    ]
+    commands = "\n".join(command for row in rows for command in row["commands"])
+    commits = Counter(commit[:12] for row in rows for commit in row["commits"])
+    return PAGE.format(
+        table=benchmark_table(rows),
+        commits=", ".join(f"{count} of `{commit}`" for commit, count in commits.most_common()),
+        failures=failure_table(rows),
+        animations="\n\n".join(animations),
+        commands=commands,
+    )
 
 
 def _describe(row: dict) -> str:

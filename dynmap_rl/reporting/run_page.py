@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from dynmap_rl.data.demonstrations import find_layout, find_meta
 from dynmap_rl.data.format.reading import find_dataset
 from dynmap_rl.evaluation.protocol import result_rows, unpack_rows
-from dynmap_rl.evaluation.statistics import shared_interval, summarize, summarize_seeds
+from dynmap_rl.evaluation.statistics import causes_text, shared_interval, summarize, summarize_seeds
 from dynmap_rl.modules.actor import Actor
 from dynmap_rl.modules.checkpoints import load_policy
 from dynmap_rl.modules.supervision import row_name
@@ -160,6 +160,8 @@ def row_text(result: dict, published: Numbers | None = None) -> str:
     if published:
         lines.append("  paper             " + _cells(published))
     lines.append(f"  {test['episodes']} episodes     {values} [{low:.1f}, {high:.1f}]")
+    if failures := causes_text(test):
+        lines.append(f"  {failures}")
     return "\n".join(lines)
 
 

@@ -70,6 +70,7 @@ def main(config: Config) -> None:
         threads=2 if config.workers == 1 else 1, presets=config.presets, root=Path.cwd(),
     )  # fmt: skip
     failed = launch(todo, run, workers=config.workers)
+    copy_pictures(cells, config)
     write(config)
     if failed:
         raise ValueError("; ".join(failed))
@@ -78,22 +79,27 @@ def main(config: Config) -> None:
 
 def write(config: Config) -> None:
     """Write ``README.md`` and ``table.json`` from the results, and print the table."""
-    from dynmap_rl.paper.benchmarks import benchmark_rows, benchmark_table
+    from dynmap_rl.paper.benchmarks import benchmark_page, benchmark_rows, benchmark_table
     from dynmap_rl.utils.files import write_bytes
 
     rows = benchmark_rows(config.results)
     if not rows:
         raise ValueError(f"{config.results} must have results; run recipes/paper/benchmarks3d.py first")
-    table = benchmark_table(rows)
-    commands = "\n".join(command for row in rows for command in row["commands"])
-    page = (
-        "# MuJoCo tasks\n\nSuccess in % with 95 % intervals over three seeds of weights, which share their start states; "
-        "tasks, cameras and experts are described in `dynmap_rl/envs/mujoco/README.md`. Written by "
-        f"`recipes/paper/benchmarks3d.py --write`.\n\n{table}\n\n```bash\n{commands}\n```\n"
-    )
-    write_bytes(config.results / "README.md", page.encode())
+    write_bytes(config.results / "README.md", benchmark_page(rows, config.results).encode())
     write_bytes(config.results / "table.json", json.dumps(rows, indent=1).encode())
-    print(f"{table}\nwritten: {config.results / 'README.md'}, {config.results / 'table.json'}")
+    print(
+        f"{benchmark_table(rows)}\nwritten: {config.results / 'README.md'}, {config.results / 'table.json'}"
+    )
+
+
+def copy_pictures(cells: list, config: Config) -> None:
+    """Copy the animation of the first seed's cells, with failures first, to the results."""
+    from dynmap_rl.utils.files import write_bytes
+
+    for cell in cells:
+        animation = config.runs / cell.name / "rollouts.gif"
+        if cell.name.endswith("seed_0") and animation.exists():
+            write_bytes(config.results / f"{cell.name}.gif", animation.read_bytes())
 
 
 if __name__ == "__main__":

@@ -75,3 +75,19 @@ def test_causes_of_task_3():
     beside = "drops beside the bin"
     assert found == ["keeps the block", beside, beside, "in the bin, but touched or moving", None]
     assert set(found) - {None} <= set(CAUSES)
+
+
+@pytest.mark.parametrize(
+    ("end", "given", "cause"),
+    [
+        ([0.6, 0.5], {}, "stops short"),
+        ([0.9, 0.5], {}, "overshoots"),
+        ([0.205, 0.5], {}, "hardly moves the object"),
+        ([0.6, 0.5], {"drop": 30}, "loses the object"),
+        ([0.6, 0.5], {"speed": 0.1}, "still moves at the end"),
+        ([0.6, 0.5], {"success": True}, None),
+    ],
+)
+def test_causes_of_tasks_that_move_an_object(end, given, cause):
+    pytest.importorskip("gymnasium_robotics")
+    assert causes(episode(end, **given), task="mujoco:FetchPush") == [cause]

@@ -115,6 +115,11 @@ def test_both_protocols_on_their_own_scenes():
     train = set(scene_seeds("train", 10_000)) | set(scene_seeds("eval", 10_000))
     assert not test & paper and not (test | paper) & train
     assert judge_in_closed_loop(actor.world_model, actor.policy, "bin_dropping", settings) == result
+    rows = unpack_rows(result["test"]["rows"])
+    assert [row["success"] for row in rows] == ["cause" not in row for row in rows]
+    assert sum(result["test"]["summary"].get("causes", {}).values()) == sum(
+        not row["success"] for row in rows
+    )
 
 
 @pytest.mark.slow
@@ -130,6 +135,8 @@ def test_the_result_does_not_depend_on_the_number_of_processes(monkeypatch):
 def test_rows_survive_their_packing(rolled):
     _, seeds, episodes = rolled
     rows = episode_rows(episodes, seeds)
+    rows[-1]["cause"] = "stops short"
+    assert ["cause" in row for row in unpack_rows(pack_rows(rows))] == ["cause" in row for row in rows]
     for row, unpacked in zip(rows, unpack_rows(pack_rows(rows)), strict=True):
         error = unpacked.pop("position_error")
         assert error == pytest.approx(row["position_error"], abs=1e-4)
