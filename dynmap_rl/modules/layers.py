@@ -15,7 +15,7 @@ def to_blocks(pixels: torch.Tensor) -> torch.Tensor:
     A convolution on blocks equals one with four times the kernel and stride on pixels, and 48 channels fill a
     processor's vector units where 3 do not.
     """
-    if pixels.dtype != torch.uint8:
+    if pixels.dtype != torch.uint8 or torch.compiler.is_compiling():  # Inductor does not compile what follows
         return F.pixel_unshuffle(pixels, BLOCK).contiguous(memory_format=torch.channels_last)
     # Moving four adjacent bytes as one number is four times as fast.
     rows = pixels.contiguous().view(torch.int32)  # (N, 3, S, S / 4)

@@ -1,5 +1,7 @@
 """Encoder and blocks of pixels."""
 
+import shutil
+
 import pytest
 import torch
 from torch.nn.functional import pixel_shuffle, pixel_unshuffle
@@ -81,3 +83,12 @@ def test_attention_reads_position_and_colour_of_the_place_it_looks_at():
         frames.float(), torch.tensor([[[x, y]]]), torch.zeros(1, 3)
     )  # rows, channels, columns
     assert (glimpse[0, 0].movedim(1, -1) == torch.tensor([30.0, 60.0, 90.0])).all()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("g++") is None, reason="torch.compile needs a compiler")
+@pytest.mark.parametrize("make", [GlimpseEncoder, PlainEncoder])
+@torch.no_grad()
+def test_a_compiled_encoder_gives_the_same(make):
+    encoder, frames = make(16), torch.randint(0, 256, (2, 3, 64, 64), dtype=torch.uint8)
+    torch.testing.assert_close(torch.compile(encoder)(frames), encoder(frames), rtol=1e-4, atol=1e-4)
