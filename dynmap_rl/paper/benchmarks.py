@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from pathlib import Path
 
+from dynmap_rl.data.derive import add_dynamics
 from dynmap_rl.evaluation.failures import CAUSES
 from dynmap_rl.evaluation.protocol import result_rows
 from dynmap_rl.evaluation.statistics import shared_interval, summarize
@@ -15,10 +16,12 @@ from .tables import join_table
 
 TASKS = "FetchPush", "FetchSlide", "PlateSlide", "Soccer"
 SEEDS = 0, 1, 2  # of weights and batches, of world models and policies
+HAND = "RGB+[P+V] of the hand"  # dynamics derived from the robot's own state, which needs no simulator
 METHODS = {  # by the row of the table: recipe and its options
     "Only-RGB": ("decoupled", ("--world_model.supervision", "none")),
     "RGB+[P]": ("decoupled", ("--world_model.supervision", "position")),
     "RGB+[P+V]": ("decoupled", ("--world_model.supervision", "position,velocity")),
+    HAND: ("decoupled", ("--world_model.supervision", "position,velocity")),
     "RGB+[P+V], ResNet-18": ("decoupled", ("--world_model.architecture", "resnet18")),
     "RGB+[P+V], ViT": ("decoupled", ("--world_model.architecture", "vit")),
     "End-to-End": ("end_to_end", ()),
@@ -66,6 +69,7 @@ def list_benchmarks(episodes: int = 500) -> dict[tuple[str, str, int], Run]:
             for seed in SEEDS:
                 arguments = ["--task", f"mujoco:{task}", *options, "--seeds", str(seed)]
                 arguments += ["--world_model.seed", str(seed)] if recipe == "decoupled" else []
+                arguments += ["--dataset", str(hand_dataset(task))] if method == HAND else []
                 arguments += ["--eval.episodes", str(episodes), "--eval.paper_episodes", "0"]
                 cell = f"mujoco:{task}", recipe, "recurrent", method
                 name = name_run(task, method, seed)
@@ -77,6 +81,17 @@ def name_run(task: str, method: str, seed: int) -> str:
     """Return the name of a run and of its result."""
     words = method.lower().translate(str.maketrans("-+ ", "___", "[],"))
     return f"{task.lower()}_{words}_seed_{seed}"
+
+
+def hand_dataset(task: str) -> Path:
+    """Return the folder of the demonstrations with the dynamics of the hand alone."""
+    return Path("datasets") / f"{task.lower()}_hand"
+
+
+def make_hand_dataset(recording: Path, folder: Path) -> None:
+    """Derive a dataset whose dynamics are those of the hand, by differences of ``observation.state``, if it is missing."""
+    if not folder.exists():
+        add_dynamics(recording, folder, columns=[0, 1, 2], replace=True)
 
 
 def read_benchmarks(results: Path) -> dict[tuple[str, str], list[dict]]:

@@ -50,7 +50,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Run the cells without a result, and write the table."""
-    from dynmap_rl.paper.benchmarks import list_benchmarks
+    from dynmap_rl.paper.benchmarks import list_benchmarks, make_hand_dataset
     from dynmap_rl.paper.launch import execute, is_done, launch, print_runs
 
     if config.write:
@@ -63,8 +63,10 @@ def main(config: Config) -> None:
         return print_runs(cells, todo)
     from dynmap_rl.training.dataset import find_or_record
 
-    for task in sorted({cell.task for cell in todo}):  # cells must not record at the same time
-        find_or_record(task)
+    recordings = {task: find_or_record(task) for task in sorted({cell.task for cell in todo})}
+    for cell in todo:  # cells must not record or derive at the same time
+        if cell.dataset:
+            make_hand_dataset(recordings[cell.task], Path(cell.dataset))
     run = partial(
         execute, recipes=RECIPES, results=config.results, runs=config.runs,
         threads=2 if config.workers == 1 else 1, presets=config.presets, root=Path.cwd(),
