@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.utils.files import read_json, write_bytes
 
 from .source_results import (
@@ -24,21 +25,22 @@ def write_source_page(results: Path, tasks: list[str], architecture: str = "glim
 
     Args:
         results: folder of the results.
-        tasks: names of the tasks, as in the names of the cells.
+        tasks: names of the tasks.
         architecture: form of the world models.
     """
     parts = [
         "# Sources of dynamics, and numbers of demonstrations",
         f"World models have {FORMS[architecture]}. SR in % with 95 % intervals over world models and policies on the "
         "shared start states; with one world model, the interval does not know how much world models differ. The share "
-        "of the gain is that of the simulator's dynamics over Only-RGB. Measures are means over world models. Written by "
+        "of the gain is that of the simulator's dynamics over Only-RGB. Measures are means over world models. Derived "
+        "columns have the verdict of `add_dynamics.py`, before any training, with the checks that failed. Written by "
         "`recipes/paper/sources.py --write`.",
     ]
     written = []
     for task in tasks:
         parts += [f"## {task}", source_table(results, task)]
         for name, plot in (("sources", plot_sources), ("measures", plot_measures)):
-            written.append(results / f"{task}_{name}.png")
+            written.append(results / f"{get_task(task).name}_{name}.png")
             plot(results, task, written[-1])
             parts.append(f"![{name}]({written[-1].name})")
         rows = [

@@ -16,7 +16,7 @@ from dynmap_rl.modules.world_model import WorldModel
 from dynmap_rl.reporting.figures import plt, save_figure
 from dynmap_rl.utils.files import read_json
 
-from .sources import DATA_ROWS, POLICIES, SIZES, SOURCES, WORLD_MODELS, cell_name
+from .sources import DATA_ROWS, POLICIES, SIZES, SOURCES, WORLD_MODELS, cell_name, dataset_folder
 from .tables import join_table
 
 CONTEXT, HORIZON = 20, 40  # steps with frames, and then without
@@ -108,7 +108,7 @@ def read_source(results: Path, task: str, source: str, policy: str, size: int = 
 
 
 def source_table(results: Path, task: str) -> str:
-    """Return the table of a task in Markdown: SR of both policies, share of the gain, and the cheap measures."""
+    """Return the table of a task in Markdown: SR of both policies, share of the gain, cheap measures, and quality."""
     found = {(s, p): read_source(results, task, s, p) for s in SOURCES for p in POLICIES}
     lines = []
     for name, source in SOURCES.items():
@@ -118,11 +118,22 @@ def source_table(results: Path, task: str) -> str:
         for policy in POLICIES:
             line += _rate(found[name, policy], found["none", policy], found["simulator", policy])
         measures = (found[name, "recurrent"] or {}).get("measures") or {}
-        lines.append([*line, *(f"{measures[m]:.3g}" if m in measures else "" for m in MEASURES)])
+        line += [f"{measures[m]:.3g}" if m in measures else "" for m in MEASURES]
+        lines.append([*line, _verdict(results, task, name)])
     head = ["dynamics"]
     for policy in POLICIES:
         head += [f"SR, {policy}", "of each world model", "share of the gain"]
-    return join_table([*head, *(text for text, _ in MEASURES.values())], lines)
+    return join_table([*head, *(text for text, _ in MEASURES.values()), "derived columns"], lines)
+
+
+def _verdict(results: Path, task: str, source: str) -> str:
+    """Return the verdict on the derived columns of a source, with the checks that failed; "" if it has none."""
+    path = results / "quality" / f"{dataset_folder(task, source, Path()).name}.json"
+    if SOURCES[source].columns is None or not path.exists():
+        return ""
+    quality = read_json(path)
+    failed = ", ".join(name for name, check in quality["checks"].items() if not check["good"])
+    return f"{quality['verdict']} ({failed})" if failed else quality["verdict"]
 
 
 def _rate(cell: dict | None, none: dict | None, full: dict | None) -> list[str]:

@@ -11,7 +11,7 @@ from dynmap_rl.data.derive import add_dynamics
 from dynmap_rl.data.recording.record import record_dataset
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.training.dataset import find_or_record
-from dynmap_rl.utils.files import write_json
+from dynmap_rl.utils.files import read_json, write_json
 
 from .cells import TASKS, Run
 
@@ -185,6 +185,14 @@ def make_datasets(cells: list[Run], datasets: Path, workers: int = 1) -> None:
                     differences = {q: d.tolist() for q, d in found["differences"].items()}
                     quality = found["quality"] | {"differences": differences}
                     write_json(folder.with_name(f"{folder.name}.quality.json"), quality)
+
+
+def copy_quality(cells: list[Run], results: Path) -> None:
+    """Copy the quality of the cells' derived datasets to ``quality/DATASET.json`` in the folder of the results."""
+    for folder in {Path(cell.dataset) for cell in cells}:
+        judged = folder.with_name(f"{folder.name}.quality.json")
+        if judged.exists():
+            write_json(results / "quality" / f"{folder.name}.json", read_json(judged))
 
 
 def _cell(

@@ -76,7 +76,7 @@ def main(config: Config) -> None:
         config, results=config.results or RESULTS / name, runs=config.runs or Path("runs") / name
     )
     from dynmap_rl.paper.launch import execute, has_run, is_done, launch, print_runs
-    from dynmap_rl.paper.sources import find_table_cells, make_datasets
+    from dynmap_rl.paper.sources import copy_quality, find_table_cells, make_datasets
     from dynmap_rl.utils.files import read_json, write_json
 
     if config.write:
@@ -98,6 +98,7 @@ def main(config: Config) -> None:
         threads=2 if config.workers == 1 else 1, presets=config.presets, root=Path.cwd(),
     )  # fmt: skip
     failed = launch(todo, run, workers=config.workers)
+    copy_quality(cells, config.results)
     measure(config, cells)
     write(config)
     if failed:
@@ -150,10 +151,9 @@ def measure(config: Config, cells: list) -> None:
 
 def write(config: Config) -> None:
     """Write README.md and the figures into the folder of the results."""
-    from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.paper.source_page import write_source_page
 
-    tasks = [get_task(task).name for task in config.tasks.split(",")]
+    tasks = config.tasks.split(",")
     if not any(config.results.glob("*.json")):
         raise ValueError(f"{config.results} must have results; run recipes/paper/sources.py first")
     print(

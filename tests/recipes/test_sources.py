@@ -64,6 +64,9 @@ def test_every_source_has_three_world_models_and_two_policies(tmp_path):
 
 
 def test_cells_run_once_and_make_a_page(calls, tmp_path):
+    checks = {"jumps": {"good": True}, "residual": {"good": False}}
+    judged = {"verdict": "doubtful", "checks": checks}
+    write_json(tmp_path / f"datasets/sources/{TASK}_tracks.quality.json", judged)
     result = run(tmp_path, "--only", "tracks,none,simulator,end_to_end")
     assert result.returncode == 0, result.stderr
     recipes = [recipe for recipe, _ in calls]
@@ -75,7 +78,11 @@ def test_cells_run_once_and_make_a_page(calls, tmp_path):
     assert reused["--pretrained"].endswith(f"{TASK}_tracks_world_model_1_recurrent")
     assert "--world_model.seed" not in reused and reused["--world_model.supervision"] == "position,velocity"
     page = (tmp_path / "results/README.md").read_text()
-    assert "frames: tracks" in page and "| RGB+[P+V], tracked | **66.7**" in page
+    assert (
+        "frames: tracks" in page
+        and "doubtful (residual)" in page
+        and "| RGB+[P+V], tracked | **66.7**" in page
+    )
     for name in (f"{TASK}_sources", f"{TASK}_measures", "data"):
         assert (tmp_path / f"results/{name}.png").exists() and f"({name}.png)" in page
     calls.clear()
@@ -111,6 +118,15 @@ def test_runs_of_the_tables_are_not_repeated(calls, tmp_path):
     for policy in ("recurrent", "feedforward"):
         copied = read_json(tmp_path / f"results/{TASK}_none_world_model_1_{policy}.json")
         assert copied["command"] == policy
+
+
+def test_a_task_in_space_has_the_sources_without_columns_of_their_own(calls, tmp_path):
+    pytest.importorskip("metaworld")
+    task = "--tasks", "mujoco:PlateSlide", "--part", "table", "--world_models", "0", "--only", "none,tracks"
+    result = run(tmp_path, *task)
+    assert result.returncode == 0, result.stderr
+    assert len(calls) == 2 and "mujoco:PlateSlide" in (tmp_path / "results/README.md").read_text()
+    assert (tmp_path / "results/plate_slide_sources.png").exists()
 
 
 @pytest.mark.slow
