@@ -10,6 +10,7 @@ from dynmap_rl.keys import DYNAMICS
 from dynmap_rl.modules.world_model import WorldModel
 
 STATES = "latent", "hidden1", "hidden2"
+GOOD = 0.9  # R^2 of the velocities
 
 
 @torch.no_grad()
@@ -37,6 +38,24 @@ def probe(world_model: WorldModel, train: TensorDictBase, test: TensorDictBase) 
         r2 = _explained(*(part[state] for part in inputs), *targets).tolist()
         result[state] = {quantity: r2[6 * i : 6 * i + 6] for i, quantity in enumerate(DYNAMICS)}
     return result
+
+
+def judge_states(probed: dict[str, dict]) -> dict:
+    """Judge a world model by the velocities that a linear map reads from its best state, without a policy.
+
+    On task 1, recurrent policies on world models with an R^2 of 0.93 and more succeeded in at least 96 % of the scenes, those
+    on world models with 0.66 and less in at most 77 %, whatever the source of the dynamics and the architecture
+    (``recipes/results/sources_plain``). Other tasks have not been measured.
+
+    Args:
+        probed: result of :func:`probe`.
+
+    Returns:
+        ``verdict`` (``good`` from an R^2 of 0.9 on, or ``doubtful``), the best ``state``, and its mean ``r2``.
+    """
+    means = {state: sum(found["velocity"]) / len(found["velocity"]) for state, found in probed.items()}
+    state = max(means, key=means.get)
+    return {"verdict": "good" if means[state] >= GOOD else "doubtful", "state": state, "r2": means[state]}
 
 
 def _states(world_model: WorldModel, episodes: TensorDictBase) -> dict[str, torch.Tensor]:

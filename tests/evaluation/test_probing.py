@@ -21,3 +21,13 @@ def test_r2_of_linear_independent_and_constant_states(monkeypatch):
     assert min(r2["latent"]["position"]) > 0.999
     assert max(r2["hidden1"]["velocity"]) < 0.1
     assert max(r2["hidden2"]["velocity"]) < 1e-9, "a constant is no better than the mean"
+
+
+def test_the_best_state_decides():
+    def explain(*values):
+        return {"velocity": list(values), "position": [1.0, 1.0]}
+
+    good = {"latent": explain(0.1, 0.2), "hidden1": explain(0.88, 0.94), "hidden2": explain(1.0, 0.5)}
+    found = probing.judge_states(good)
+    assert (found["verdict"], found["state"], round(found["r2"], 3)) == ("good", "hidden1", 0.91)
+    assert probing.judge_states(good | {"hidden1": explain(0.88, 0.9)})["verdict"] == "doubtful"

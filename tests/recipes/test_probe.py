@@ -26,7 +26,7 @@ def test_writes_errors_and_probes_of_every_world_model(trained, recording, tmp_p
     assert (facts["train_episodes"], facts["test_episodes"]) == (3, 2)
     assert list(facts["open_loop"]) == ["RGB+[P], decoupled"]
     assert len(facts["open_loop"]["RGB+[P], decoupled"]["model"]["cart_mm"]) == 4
-    assert list(facts["probes"]) == ["Only-RGB, decoupled", "RGB+[P], decoupled"]
+    assert list(facts["probes"]) == list(facts["verdicts"]) == ["Only-RGB, decoupled", "RGB+[P], decoupled"]
     assert len(facts["probes"]["Only-RGB, decoupled"]["latent"]["velocity"]) == 6
     for found in facts["perception"].values():
         assert list(found) == ["held-out demonstrations", "first ten steps"]
