@@ -10,6 +10,7 @@ from pathlib import Path
 import commands
 import pytest
 import torch
+from own_task import check_renderer
 from stress import kills
 
 from dynmap_rl.data import load_dataset, load_meta, sample_windows
@@ -182,6 +183,18 @@ def test_errors_of_derived_dynamics_grow_with_noise(load, recording, tmp_path, m
     errors = [found["state"][f"savgol, {noise} mm"]["velocity"]["linear"] for noise in (0, 2, 5, 10)]
     assert errors == sorted(errors) and found["state"]["central, 0 mm"]["position"]["linear"] == 0
     assert found["frames"]["tracks, savgol"]["position"]["linear"] < 15 and found["episodes"] == 2
+
+
+@pytest.mark.slow
+def test_recording_is_compared_with_the_benchmarks_own_rendering(load, tmp_path, monkeypatch):
+    check_renderer()
+    pytest.importorskip("gymnasium_robotics")
+    output = tmp_path / "found.json"
+    arguments = ["--tasks", "FetchPush", "--episodes", "1", "--frames", "2", "--output", str(output)]
+    monkeypatch.setattr("sys.argv", ["x.py", *arguments])
+    load("recording3d").main()
+    row = read_json(output)["tasks"]["FetchPush"]
+    assert row["ratio"] == pytest.approx(row["ours"]["cpu"] / row["theirs"]["cpu"]) and row["ratio"] > 0
 
 
 @pytest.mark.slow

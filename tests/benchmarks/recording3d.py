@@ -1,0 +1,109 @@
+"""Frames a second of recording demonstrations of the MuJoCo tasks, beside the benchmarks' own rendering.
+
+    uv run --extra mujoco python tests/benchmarks/recording3d.py
+    uv run --extra mujoco python tests/benchmarks/recording3d.py --tasks Soccer --episodes 5 --output found.json
+
+Ours are whole episodes, with resets, expert, dynamics and frames; theirs are steps of random actions with ``env.render()``
+at the same size. Both have one thread, one after the other, by the time of the processor (which leaves out other load)
+and by the clock. Writes ``recipes/results/measurements/recording3d.json``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+import gymnasium
+import torch
+
+from dynmap_rl.data.recording.plans import SCRIPTED, Plan, demonstrate
+from dynmap_rl.envs.tasks import get_task
+from dynmap_rl.evaluation.rollout import scene_seeds
+from dynmap_rl.paper.benchmarks import TASKS
+from dynmap_rl.utils.cli import command_line
+from dynmap_rl.utils.files import write_json
+from dynmap_rl.utils.version import find_commit
+
+os.environ.setdefault("MUJOCO_GL", "egl")  # read by their renderer when it is made
+RESULTS = Path(__file__).parents[2] / "recipes/results/measurements" / "recording3d.json"
+SIZE = 64
+
+
+def measure(run: Callable[[], int]) -> dict[str, float]:
+    """Return frames a second by the processor's time and by the clock; ``run`` returns the number of frames."""
+    clock, cpu = time.perf_counter(), time.process_time()
+    frames = run()
+    return {"cpu": frames / (time.process_time() - cpu), "clock": frames / (time.perf_counter() - clock)}
+
+
+def make_theirs(task: str) -> gymnasium.Env:
+    """Make the environment of a task as its authors render it, with frames of our size."""
+    environment = get_task(f"mujoco:{task}").environment
+    if task.startswith("Fetch"):
+        import gymnasium_robotics
+
+        gymnasium.register_envs(gymnasium_robotics)
+        return gymnasium.make(environment, render_mode="rgb_array", width=SIZE, height=SIZE)
+    from metaworld.env_dict import ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE
+
+    env = ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE[f"{environment}-goal-observable"](render_mode="rgb_array")
+    env.mujoco_renderer.width = env.mujoco_renderer.height = SIZE  # which has no viewer yet
+    return env
+
+
+def record(task: str, episodes: int) -> dict[str, float]:
+    """Measure whole demonstrations."""
+    torch.set_num_threads(1)
+    name, plans = f"mujoco:{task}", [Plan(seed, SCRIPTED) for seed in scene_seeds("validation", episodes)]
+    demonstrate(name, plans[:1])  # loads models and libraries
+    return measure(lambda: demonstrate(name, plans)["action"].shape[:2].numel())
+
+
+def render(task: str, frames: int) -> dict[str, float]:
+    """Measure their environment, with random actions."""
+    env, steps = make_theirs(task), get_task(f"mujoco:{task}").layout.steps
+    env.reset(seed=0)
+    env.render()
+
+    def run() -> int:
+        for frame in range(frames):
+            if frame % steps == 0:
+                env.reset(seed=frame)
+            env.step(env.action_space.sample())
+            env.render()
+        return frames
+
+    return measure(run)
+
+
+def compare(task: str, episodes: int, frames: int) -> dict:
+    """Measure a task, each part in a process of its own: renderers of one process share their settings."""
+    found = {}
+    for name, run, amount in (("ours", record, episodes), ("theirs", render, frames)):
+        with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+            found[name] = pool.submit(run, task, amount).result()
+    return found | {"ratio": found["ours"]["cpu"] / found["theirs"]["cpu"]}
+
+
+def main() -> None:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--tasks", default=",".join(TASKS))
+    parser.add_argument("--episodes", type=int, default=20, help="episodes that are recorded")
+    parser.add_argument("--frames", type=int, default=100, help="frames of the benchmark's own rendering")
+    parser.add_argument("--output", type=Path, default=RESULTS)
+    options = parser.parse_args()
+    rows = {task: compare(task, options.episodes, options.frames) for task in options.tasks.split(",")}
+    for task, row in rows.items():
+        print(f"{task}: {row['ours']['cpu']:.0f} frames/s of one core, theirs {row['theirs']['cpu']:.0f}")
+    write_json(options.output, {"tasks": rows, "command": command_line(sys.argv), "commit": find_commit()})
+
+
+if __name__ == "__main__":
+    main()
