@@ -3,6 +3,7 @@ from .errors import policy_errors as policy_errors
 from .errors import prediction_errors as prediction_errors
 from .failures import failure_causes as failure_causes
 from .open_loop import open_loop_errors as open_loop_errors
+from .probing import judge_states as judge_states
 from .probing import probe as probe
 from .protocol import evaluate as evaluate
 from .protocol import judge_in_closed_loop as judge_in_closed_loop

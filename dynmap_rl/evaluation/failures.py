@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from tensordict import TensorDictBase
 
+from dynmap_rl.envs.protocol import BaseTask
 from dynmap_rl.envs.scene import BinRanges
 from dynmap_rl.envs.task import ROCKING, Task
-from dynmap_rl.envs.tasks import REST_SPEED, SUCCESS_DISTANCE, get_task
+from dynmap_rl.envs.tasks import (
+    REST_SPEED,
+    SUCCESS_DISTANCE,
+    BalanceReaching,
+    BalanceReachingObstacle,
+    BinDropping,
+    get_task,
+)
 
 CAUSES = (
     "drops at the start", "drops while accelerating", "drops while braking", "drops at the goal",
     "touches the obstacle", "still moves at the end", "stops short", "overshoots", "stops beside the goal",
     "keeps the block", "drops beside the bin", "in the bin, but touched or moving",
-    "loses the object", "hardly moves the object",
+    "loses the object", "hardly moves the object", "ends above or below the goal", "other",
 )  # fmt: skip
 NEAR = SUCCESS_DISTANCE  # m, from start or goal
 LAST = 10  # steps, over which the position error is a mean
@@ -28,20 +38,34 @@ def failure_causes(episodes: TensorDictBase, task: str) -> list[str | None]:
     falls. In task 2, a touch before a drop is the cause. A cart that does not arrive is still moving if its mean speed in
     the last 10 steps exceeds 20 mm/s. Otherwise it stands before, behind or beside the goal, as seen from the start.
 
-    In tasks without cart and block, the object, which is the first body, is lost (it falls off the table), never moves
-    10 mm away from its start, or does not arrive, with the causes of a cart that does not.
+    In tasks without cart and block, the object is the first body. It is lost (it falls off the table), or stays within
+    10 mm of its start. Otherwise the cause is where it is in the last frame: before, behind, beside, or above or below the
+    goal, at rest or not. Tasks of one's own with cart and block, and those whose goal is not a point of two or three
+    coordinates, have the cause "other".
 
     Args:
         episodes: result ``[E, T]`` of :func:`dynmap_rl.evaluation.roll_out`.
-        task: name of the task.
+        task: name of the task, or ``module:Class``.
 
     Returns:
         One of ``CAUSES``, or None for a success.
     """
-    find = _carrying_cause if isinstance(get_task(task), Task) else _moving_cause
-    find = _bin_cause if task == "bin_dropping" else find
+    find = _choose(get_task(task))
     success = episodes["next", "is_success"][:, -1, 0].tolist()
     return [None if good else find(episode) for good, episode in zip(success, episodes, strict=True)]
+
+
+def _choose(task: BaseTask) -> Callable[[TensorDictBase], str]:
+    if isinstance(task, BinDropping):
+        return _bin_cause
+    if isinstance(task, BalanceReaching | BalanceReachingObstacle):
+        return _carrying_cause
+    known = not isinstance(task, Task) and task.layout.goal_size in (2, 3)
+    return _moving_cause if known and len(task.layout.position) >= task.layout.goal_size else _other_cause
+
+
+def _other_cause(episode: TensorDictBase) -> str:
+    return "other"
 
 
 def _carrying_cause(episode: TensorDictBase) -> str:
@@ -75,10 +99,14 @@ def _drop_cause(episode: TensorDictBase, step: int) -> str:
 
 def _miss_cause(episode: TensorDictBase) -> str:
     position, velocity = (episode["dynamics", name][:, :2].numpy() for name in ("position", "velocity"))
-    goal = episode["goal"][0, :2].numpy()
     if np.linalg.norm(velocity[-LAST:], axis=1).mean() > REST_SPEED:
         return "still moves at the end"
-    way, offset = goal - position[0], position[-LAST:].mean(0) - goal
+    return _place(position[0], position[-LAST:].mean(0), episode["goal"][0].numpy())
+
+
+def _place(start: np.ndarray, end: np.ndarray, goal: np.ndarray) -> str:
+    """Return where ``end`` is, as seen from ``start``, each ``[2]``."""
+    way, offset = goal - start, end - goal
     along = float(offset @ way) / max(float(np.linalg.norm(way)), 1e-9)
     across = max(float(offset @ offset) - along**2, 0.0) ** 0.5
     if abs(along) < across:
@@ -98,7 +126,11 @@ def _bin_cause(episode: TensorDictBase) -> str:
 def _moving_cause(episode: TensorDictBase) -> str:
     if bool(episode["next", "dropped"][-1]):
         return "loses the object"
-    place = episode["dynamics", "position"][:, :3]
-    if float((place - place[0]).norm(dim=-1).max()) < MOVED:
+    goal = episode["goal"][0].numpy()
+    place = episode["dynamics", "position"][:, : len(goal)].numpy()
+    if np.linalg.norm(place - place[0], axis=1).max() < MOVED:
         return "hardly moves the object"
-    return _miss_cause(episode)
+    offset = place[-1] - goal
+    if np.linalg.norm(offset[2:]) > np.linalg.norm(offset[:2]):
+        return "ends above or below the goal"
+    return _place(place[0, :2], place[-1, :2], goal[:2])

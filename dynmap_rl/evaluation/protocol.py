@@ -120,7 +120,8 @@ def pack_rows(rows: list[dict]) -> dict:
     """Return episode rows of consecutive scenes as columns.
 
     Args:
-        rows: see :func:`dynmap_rl.evaluation.episode_rows`.
+        rows: see :func:`dynmap_rl.evaluation.episode_rows`; those of :func:`evaluate` also have the ``cause`` of a failure
+            (see :func:`dynmap_rl.evaluation.failure_causes`).
 
     Returns:
         ``first_scene_seed``, a text of 0 and 1 for each of ``success``, ``dropped`` and ``touched``, the list

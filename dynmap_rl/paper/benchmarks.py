@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from pathlib import Path
 
 from dynmap_rl.data.derive import add_dynamics
-from dynmap_rl.evaluation.failures import CAUSES
 from dynmap_rl.evaluation.protocol import result_rows
 from dynmap_rl.evaluation.statistics import shared_interval, summarize
 from dynmap_rl.utils.files import read_json
 
 from .cells import Run
-from .tables import join_table
+from .tables import cause_table, commits_text, join_table
 
 TASKS = "FetchPush", "FetchSlide", "PlateSlide", "Soccer"
 SEEDS = 0, 1, 2  # of weights and batches, of world models and policies
-HAND = "RGB+[P+V] of the hand"  # dynamics derived from the robot's own state, which needs no simulator
+HAND = "RGB+[P+V] of the hand"  # derived from the recorded position of the hand, which needs no simulator
 METHODS = {  # by the row of the table: recipe and its options
     "Only-RGB": ("decoupled", ("--world_model.supervision", "none")),
     "RGB+[P]": ("decoupled", ("--world_model.supervision", "position")),
@@ -38,18 +38,19 @@ nothing about further trainings. Tasks, cameras and experts are described in
 
 {table}
 
-Runs of code: {commits}.
+Runs by commit: {commits}.
 
 ## What fails
 
-In % of the episodes. An object is lost when it falls off the table; one that is hardly moved stays within 10 mm of its
-start; one that stops short, overshoots or stops beside the goal does so as seen from its start.
+An object that is lost has fallen off the table, and one that is hardly moved stays within 10 mm of its start. In all
+other failures the cause is where the object is in the last frame, as seen from its start
+([definitions](../../../dynmap_rl/evaluation/failures.py)).
 
 {failures}
 
 ## Episodes
 
-Eight episodes of the first seed, the failed ones first, and at most four of these where as many succeed.
+Eight episodes of the first seed, failures first. At most four are failures if four others succeeded.
 
 {animations}
 
@@ -85,7 +86,7 @@ def name_run(task: str, method: str, seed: int) -> str:
 
 def hand_dataset(task: str) -> Path:
     """Return the folder of the demonstrations with the dynamics of the hand alone."""
-    return Path("datasets") / f"{task.lower()}_hand"
+    return Path("datasets") / f"{re.sub('(?<=[a-z])(?=[A-Z])', '_', task).lower()}_hand"
 
 
 def make_hand_dataset(recording: Path, folder: Path) -> None:
@@ -102,6 +103,12 @@ def read_benchmarks(results: Path) -> dict[tuple[str, str], list[dict]]:
         if path.exists():
             found.setdefault((task, method), []).append(read_json(path))
     return found
+
+
+def read_experts(results: Path) -> dict[str, dict]:
+    """Read the results of the experts, ``expert_TASK.json`` of ``recipes/evaluate.py --task mujoco:TASK``, by task."""
+    paths = {task: results / f"expert_{task.lower()}.json" for task in TASKS}
+    return {task: read_json(path) for task, path in paths.items() if path.exists()}
 
 
 def benchmark_rows(results: Path) -> list[dict]:
@@ -132,16 +139,24 @@ def benchmark_rows(results: Path) -> list[dict]:
                 "rates": [summarize(part)["SR"] for part in rows],
                 "causes": summary.get("causes", {}),
                 "commands": [cell["command"] for cell in cells],
-                "commits": [cell["commit"] for cell in cells],
+                "commits": [str(cell.get("commit")) for cell in cells],
             }
         )
     return table
 
 
-def benchmark_table(rows: list[dict]) -> str:
-    """Return the table in Markdown: a line for each method, a column for each task; empty where there is no result."""
-    cells = {(row["task"], row["method"]): row for row in rows}
-    lines = []
+def benchmark_table(rows: list[dict], experts: dict[str, dict] | None = None) -> str:
+    """Return the table in Markdown: a line for each method, a column for each task; empty where there is no result.
+
+    Args:
+        rows: see :func:`benchmark_rows`.
+        experts: see :func:`read_experts`.
+    """
+    cells, lines = {(row["task"], row["method"]): row for row in rows}, []
+    if experts:
+        rates = {task: (r["rates"]["success"], *r["intervals"]["success"]) for task, r in experts.items()}
+        texts = {task: "{:.1f} [{:.1f}, {:.1f}]".format(*numbers) for task, numbers in rates.items()}
+        lines.append(["expert, from the state", *(texts.get(task, "") for task in TASKS)])
     for method in METHODS:
         line = [method]
         for task in TASKS:
@@ -151,34 +166,25 @@ def benchmark_table(rows: list[dict]) -> str:
     return join_table(["success %", *TASKS], lines)
 
 
-def failure_table(rows: list[dict]) -> str:
-    """Return the failed episodes by cause (% of the episodes) in Markdown: a line for each task and method."""
-    causes = sorted({cause for row in rows for cause in row["causes"]}, key=CAUSES.index)
-    lines = [
-        [
-            row["task"], row["method"], f"{100 - row['SR']:.1f}",
-            *(f"{100 * row['causes'].get(cause, 0) / row['episodes']:.1f}" for cause in causes),
-        ]
-        for row in rows
-    ]  # fmt: skip
-    return join_table(["% of the episodes", "", "fail", *causes], lines)
-
-
 def benchmark_page(rows: list[dict], folder: Path) -> str:
     """Return the page of the results in Markdown, with the animations that are in the folder."""
+    titles = [f"{row['task']}: {row['method']}" for row in rows]
     animations = [
-        f"{row['task']}, {row['method']}:\n\n![Episodes, failures first]({name})"
-        for row in rows
+        f"{title}:\n\n![Episodes, failures first]({name})"
+        for title, row in zip(titles, rows, strict=True)
         if (folder / (name := f"{name_run(row['task'], row['method'], SEEDS[0])}.gif")).exists()
     ]
-    commands = "\n".join(command for row in rows for command in row["commands"])
-    commits = Counter(commit[:12] for row in rows for commit in row["commits"])
+    experts = read_experts(folder)
+    commands = [result["command"] for result in experts.values()]
+    commands += [command for row in rows for command in row["commands"]]
     return PAGE.format(
-        table=benchmark_table(rows),
-        commits=", ".join(f"{count} of `{commit}`" for commit, count in commits.most_common()),
-        failures=failure_table(rows),
+        table=benchmark_table(rows, experts),
+        commits=commits_text(Counter(commit for row in rows for commit in row["commits"])),
+        failures=cause_table(
+            (t, row["episodes"], row["causes"]) for t, row in zip(titles, rows, strict=True)
+        ),
         animations="\n\n".join(animations),
-        commands=commands,
+        commands="\n".join(commands),
     )
 
 

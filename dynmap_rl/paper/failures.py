@@ -13,7 +13,7 @@ from dynmap_rl.runs.lookup import load_actor
 from dynmap_rl.utils.files import read_json
 
 from .cells import TASKS
-from .tables import join_table
+from .tables import cause_table
 
 _DECOUPLED = [
     *(f"{task}_decoupled_{some}_recurrent" for task in TASKS for some in ("none", "position_velocity")),
@@ -32,7 +32,9 @@ REPEATED = "succeeds when repeated"  # frames in other batches differ in their l
 
 
 def find_failures(runs: Sequence[Path]) -> dict:
-    """Run the failed episodes of a cell again, those of each run's first policy, and find their causes.
+    """Find the causes of the failed episodes of a cell, those of each run's first policy.
+
+    Where the result does not name them, the episodes are run again.
 
     Args:
         runs: folders of complete runs of the cell.
@@ -46,10 +48,13 @@ def find_failures(runs: Sequence[Path]) -> dict:
         result = read_json(run / "eval.json")
         rows = result_rows(result)[0]
         episodes += len(rows)
-        if seeds := [row["scene_seed"] for row in rows if not row["success"]]:
+        failed = [row for row in rows if not row["success"]]
+        seeds, causes = [row["scene_seed"] for row in failed], [row.get("cause") for row in failed]
+        if not all(causes):  # an older result
             again = roll_out(load_actor(run, result["seeds"][0]), result["task"], seeds)
-            for seed, cause in zip(seeds, failure_causes(again, result["task"]), strict=True):
-                scenes.setdefault(cause or REPEATED, []).append(seed)
+            causes = failure_causes(again, result["task"])
+        for seed, cause in zip(seeds, causes, strict=True):
+            scenes.setdefault(cause or REPEATED, []).append(seed)
     facts = {name: result[name] for name in ("task", "row", "policy")}
     facts |= {"training": result["world_model"]["training"], "runs": [run.name for run in runs]}
     return facts | {"episodes": episodes, "scenes": scenes}
@@ -84,16 +89,10 @@ def markdown_failures(failures: list[dict]) -> str:
     Args:
         failures: results of :func:`find_failures`.
     """
-    causes = _causes(failures)
-    rows = [
-        [
-            _title(one),
-            f"{100 * sum(map(len, one['scenes'].values())) / one['episodes']:.1f}",
-            *(f"{_share(one, cause):.1f}" if cause in one["scenes"] else "" for cause in causes),
-        ]
+    return cause_table(
+        (_title(one), one["episodes"], {cause: len(scenes) for cause, scenes in one["scenes"].items()})
         for one in failures
-    ]
-    return join_table(["% of the episodes", "fail", *causes], rows)
+    )
 
 
 def _causes(failures: list[dict]) -> list[str]:

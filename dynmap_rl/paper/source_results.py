@@ -9,7 +9,7 @@ import torch
 from scipy.stats import spearmanr
 from tensordict import TensorDictBase
 
-from dynmap_rl.evaluation.probing import probe
+from dynmap_rl.evaluation.probing import judge_states, probe
 from dynmap_rl.evaluation.protocol import result_rows
 from dynmap_rl.evaluation.statistics import shared_interval, summarize
 from dynmap_rl.modules.world_model import WorldModel
@@ -46,8 +46,8 @@ def measure_world_model(model: WorldModel, train: TensorDictBase, test: TensorDi
     """
     found = probe(model, train, test)
     result = {
-        f"probe_{quantity}": max(float(np.mean(states[quantity])) for states in found.values())
-        for quantity in ("position", "velocity")
+        "probe_position": max(float(np.mean(states["position"])) for states in found.values()),
+        "probe_velocity": judge_states(found)["r2"],
     }
     x, y = _predictions(model, train), train["dynamics", "position"]
     mean, center = x.flatten(0, 1).mean(0), y[:, 1:].flatten(0, 1).double().mean(0)

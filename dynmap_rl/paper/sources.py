@@ -184,15 +184,18 @@ def make_datasets(cells: list[Run], datasets: Path, workers: int = 1) -> None:
                     found = add_dynamics(recording, folder, **source.columns, replace=True)
                     differences = {q: d.tolist() for q, d in found["differences"].items()}
                     quality = found["quality"] | {"differences": differences}
-                    write_json(folder.with_name(f"{folder.name}.quality.json"), quality)
+                    write_json(_quality_file(folder), quality)
 
 
 def copy_quality(cells: list[Run], results: Path) -> None:
     """Copy the quality of the cells' derived datasets to ``quality/DATASET.json`` in the folder of the results."""
     for folder in {Path(cell.dataset) for cell in cells}:
-        judged = folder.with_name(f"{folder.name}.quality.json")
-        if judged.exists():
+        if (judged := _quality_file(folder)).exists():
             write_json(results / "quality" / f"{folder.name}.json", read_json(judged))
+
+
+def _quality_file(dataset: Path) -> Path:
+    return dataset.with_name(f"{dataset.name}.quality.json")
 
 
 def _cell(

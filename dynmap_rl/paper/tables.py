@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 
+from dynmap_rl.evaluation.failures import CAUSES
 from dynmap_rl.evaluation.statistics import rate_gap, summarize
 
 from .cells import Key
@@ -183,6 +185,31 @@ def _short(numbers: dict, others: list[str]) -> str:
     return f"{mean:.0f} ({std:.1f})" + (f"; {rest}" if rest else "")
 
 
+def cause_table(rows: Iterable[tuple[str, int, Mapping[str, int]]]) -> str:
+    """Return failed episodes by cause (% of the episodes) in Markdown.
+
+    Args:
+        rows: title, number of episodes, and number of failed episodes by cause.
+    """
+    rows = list(rows)
+    found = {cause for *_, counts in rows for cause in counts}
+    causes = [*(cause for cause in CAUSES if cause in found), *sorted(found - set(CAUSES))]
+    lines = [
+        [
+            title,
+            f"{100 * sum(counts.values()) / episodes:.1f}",
+            *(f"{100 * counts[cause] / episodes:.1f}" if cause in counts else "" for cause in causes),
+        ]
+        for title, episodes, counts in rows
+    ]
+    return join_table(["% of the episodes", "fail", *causes], lines)
+
+
+def commits_text(commits: Counter[str]) -> str:
+    """Return how many runs each commit has made."""
+    return ", ".join(f"{count} of `{commit}`" for commit, count in commits.most_common())
+
+
 def _notes(cells: Iterable[Cell]) -> str:
     """Return what is missing of some cells, and how many runs are of which commit where there are several."""
     cells = list(cells)
@@ -197,6 +224,5 @@ def _notes(cells: Iterable[Cell]) -> str:
         )
     commits = count_commits(cells)
     if len(commits) > 1:
-        made = ", ".join(f"{count} of `{commit}`" for commit, count in commits.most_common())
-        text += f" Runs of different code: {made}."
+        text += f" Runs of different code: {commits_text(commits)}."
     return text

@@ -1,12 +1,13 @@
-"""Run the grid of the MuJoCo tasks: world models, end-to-end training, ACT and Diffusion Policy; write the table.
+"""Run the grid of the MuJoCo tasks: world models, end-to-end training, ACT and Diffusion Policy; write the page.
 
     python recipes/paper/benchmarks3d.py --dry_run                    # cells, those that are complete, remaining time
     python recipes/paper/benchmarks3d.py --only plateslide --workers 2
     python recipes/paper/benchmarks3d.py --results runs/benchmarks3d_results     # a grid of your own
-    python recipes/paper/benchmarks3d.py --write                      # the table from the results alone
+    python recipes/paper/benchmarks3d.py --write                      # the page from the results alone
 
 A cell is a run of another recipe for one task, method and seed, and its result a JSON file; cells with a result are skipped.
-The same command resumes a stopped grid, and every cell. Needs pip install '.[lerobot,mujoco]'.
+The same command resumes a stopped grid, and every cell. One row has the dynamics of the hand alone, in datasets/TASK_hand,
+which are derived from the recordings. The page has success, failures by cause, and animations. Needs pip install '.[lerobot,mujoco]'.
 """
 
 import json
@@ -49,7 +50,7 @@ class Config:
 
 
 def main(config: Config) -> None:
-    """Run the cells without a result, and write the table."""
+    """Run the cells without a result, and write the page."""
     from dynmap_rl.paper.benchmarks import list_benchmarks, make_hand_dataset
     from dynmap_rl.paper.launch import execute, is_done, launch, print_runs
 
@@ -95,12 +96,12 @@ def write(config: Config) -> None:
 
 
 def copy_pictures(cells: list, config: Config) -> None:
-    """Copy the animation of the first seed's cells, with failures first, to the results."""
+    """Copy the animation of RGB+[P+V] with the first seed, failures first, to the results."""
     from dynmap_rl.utils.files import write_bytes
 
     for cell in cells:
         animation = config.runs / cell.name / "rollouts.gif"
-        if cell.name.endswith("seed_0") and animation.exists():
+        if cell.name.endswith("rgb_p_v_seed_0") and animation.exists():
             write_bytes(config.results / f"{cell.name}.gif", animation.read_bytes())
 
 

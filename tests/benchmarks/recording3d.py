@@ -3,9 +3,9 @@
     uv run --extra mujoco python tests/benchmarks/recording3d.py
     uv run --extra mujoco python tests/benchmarks/recording3d.py --tasks Soccer --episodes 5 --output found.json
 
-Ours are whole episodes, with resets, expert, dynamics and frames; theirs are steps of random actions with ``env.render()``
-at the same size. Both have one thread, one after the other, by the time of the processor (which leaves out other load)
-and by the clock. Writes ``recipes/results/measurements/recording3d.json``.
+``ours`` records whole episodes, with resets, expert, dynamics and frames. ``theirs`` takes random actions in the benchmark's
+environment and calls ``env.render()``, at the same size. Both have one thread, one after the other, by the time of the
+processor (which leaves out other load) and by the clock. Writes ``recipes/results/measurements/recording3d.json``.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def make_theirs(task: str) -> gymnasium.Env:
     from metaworld.env_dict import ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE
 
     env = ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE[f"{environment}-goal-observable"](render_mode="rgb_array")
-    env.mujoco_renderer.width = env.mujoco_renderer.height = SIZE  # which has no viewer yet
+    env.mujoco_renderer.width = env.mujoco_renderer.height = SIZE  # its viewer is made later
     return env
 
 

@@ -1,7 +1,10 @@
 """The grid of MuJoCo tasks: cells, rows and table."""
 
 import pytest
+import torch
+from own_task import check_renderer
 
+from dynmap_rl.data import load_dataset, record_dataset
 from dynmap_rl.evaluation.protocol import pack_rows
 from dynmap_rl.paper.benchmarks import (
     METHODS,
@@ -10,8 +13,8 @@ from dynmap_rl.paper.benchmarks import (
     benchmark_page,
     benchmark_rows,
     benchmark_table,
-    failure_table,
     list_benchmarks,
+    make_hand_dataset,
 )
 from dynmap_rl.utils.cli import parse_settings, read_arguments
 from dynmap_rl.utils.files import write_json
@@ -25,7 +28,7 @@ def make_result(success, first=0):
         for i, good in enumerate(success)
     ]
     result = {"test": {"rows": pack_rows(values)}}
-    return {"command": "python recipes/x.py", "commit": "0123456789abcdef", "results": [result]}
+    return {"command": "python recipes/x.py", "commit": "abc-dirty", "results": [result]}
 
 
 def test_every_cell_is_a_command_that_its_recipe_understands():
@@ -53,10 +56,30 @@ def test_the_table_has_what_the_results_have(tmp_path):
     table = benchmark_table([row])
     assert "62.5" in table and "2 of 3 seeds" in table and all(method in table for method in METHODS)
     assert row["rates"] == [75, 50] and row["causes"] == {"overshoots": 3}
-    assert "37.5" in failure_table([row]) and "stops short" not in failure_table([row])
     (tmp_path / "soccer_rgb_p_seed_0.gif").touch()
+    expert = {"rates": {"success": 98.0}, "intervals": {"success": [96.0, 99.0]}, "command": "python y.py"}
+    write_json(tmp_path / "expert_soccer.json", expert)
     page = benchmark_page([row], tmp_path)
-    assert "soccer_rgb_p_seed_0.gif" in page and "2 of `0123456789ab`" in page
+    assert "soccer_rgb_p_seed_0.gif" in page and "2 of `abc-dirty`" in page and "overshoots" in page
+    assert "98.0 [96.0, 99.0]" in page and "python y.py" in page
     write_json(tmp_path / f"{cells['Soccer', 'RGB+[P]', 2].name}.json", make_result([1, 1, 1, 1], first=9))
     with pytest.raises(ValueError, match="same scenes"):
         benchmark_rows(tmp_path)
+
+
+def test_a_page_without_failures_or_commits(tmp_path):
+    result = make_result([1, 1]) | {"commit": None}
+    write_json(tmp_path / f"{list_benchmarks()['Soccer', 'ACT', 0].name}.json", result)
+    page = benchmark_page(benchmark_rows(tmp_path), tmp_path)
+    assert "1 of `None`" in page and "| Soccer: ACT | 0.0 |" in page
+
+
+def test_dynamics_of_the_hand_are_its_recorded_positions(tmp_path):
+    pytest.importorskip("metaworld")
+    check_renderer()
+    record_dataset(tmp_path / "plate_slide", "mujoco:PlateSlide", episodes=1, eval_episodes=1, workers=1)
+    for _ in range(2):  # the second time, it is there
+        make_hand_dataset(tmp_path / "plate_slide", tmp_path / "hand")
+    hand, full = (load_dataset(tmp_path / name, "train") for name in ("hand", "plate_slide"))
+    assert hand["dynamics", "position"].shape == (1, 80, 3)
+    torch.testing.assert_close(hand["dynamics", "position"], full["dynamics", "position"][..., -3:])

@@ -36,13 +36,15 @@ def test_a_cell_is_trained_judged_and_tabled_once(tmp_path):
     sizes = "--episodes", "2", "--eval_episodes", "1", "--workers", "1"
     assert run(tmp_path, "collect", "--task", "mujoco:PlateSlide", *sizes).returncode == 0
     grid = "benchmarks3d", "--results", "found", "--episodes", "2", "--presets", PRESETS, "--only"
-    for policy in ("act", "diffusion_policy"):
-        done = run(tmp_path, *grid, f"plateslide_{policy}_seed_1")
+    for cell in ("rgb_p_v_seed_0", "act_seed_1", "diffusion_policy_seed_1"):
+        done = run(tmp_path, *grid, f"plateslide_{cell}")
         assert done.returncode == 0, done.stderr
+    assert (tmp_path / "found/plateslide_rgb_p_v_seed_0.gif").exists()
     result = read_json(tmp_path / "found/plateslide_act_seed_1.json")
     assert (result["row"], result["seeds"], result["test_protocol"]["episodes"]) == ("ACT", [1], 2)
     rows = read_json(tmp_path / "found/table.json", list)
     assert [(row["task"], row["method"]) for row in rows] == [
+        ("PlateSlide", "RGB+[P+V]"),
         ("PlateSlide", "ACT"),
         ("PlateSlide", "Diffusion Policy"),
     ]
