@@ -9,19 +9,25 @@ from pathlib import Path
 from dynmap_rl.data.derive import add_dynamics
 from dynmap_rl.evaluation.protocol import result_rows
 from dynmap_rl.evaluation.statistics import shared_interval, summarize
-from dynmap_rl.utils.files import read_json
+from dynmap_rl.utils.files import read_json, write_json
 
 from .cells import Run
 from .tables import cause_table, commits_text, join_table
 
 TASKS = "FetchPush", "FetchSlide", "PlateSlide", "Soccer"
 SEEDS = 0, 1, 2  # of weights and batches, of world models and policies
-HAND = "RGB+[P+V] of the hand"  # derived from the recorded position of the hand, which needs no simulator
+DERIVED = {  # rows whose dynamics need no simulator: name of their dataset, and how its columns are derived
+    "RGB+[P+V] of the hand": ("hand", {"columns": [0, 1, 2]}),  # of its recorded positions
+    "RGB+[P+V], tracked": (
+        "tracks",
+        {"source": "tracks", "objects": 2},
+    ),  # of the object and the hand in the frames
+}
 METHODS = {  # by the row of the table: recipe and its options
     "Only-RGB": ("decoupled", ("--world_model.supervision", "none")),
     "RGB+[P]": ("decoupled", ("--world_model.supervision", "position")),
     "RGB+[P+V]": ("decoupled", ("--world_model.supervision", "position,velocity")),
-    HAND: ("decoupled", ("--world_model.supervision", "position,velocity")),
+    **{row: ("decoupled", ("--world_model.supervision", "position,velocity")) for row in DERIVED},
     "RGB+[P+V], ResNet-18": ("decoupled", ("--world_model.architecture", "resnet18")),
     "RGB+[P+V], ViT": ("decoupled", ("--world_model.architecture", "vit")),
     "End-to-End": ("end_to_end", ()),
@@ -70,7 +76,7 @@ def list_benchmarks(episodes: int = 500) -> dict[tuple[str, str, int], Run]:
             for seed in SEEDS:
                 arguments = ["--task", f"mujoco:{task}", *options, "--seeds", str(seed)]
                 arguments += ["--world_model.seed", str(seed)] if recipe == "decoupled" else []
-                arguments += ["--dataset", str(hand_dataset(task))] if method == HAND else []
+                arguments += ["--dataset", str(derived_dataset(task, method))] if method in DERIVED else []
                 arguments += ["--eval.episodes", str(episodes), "--eval.paper_episodes", "0"]
                 cell = f"mujoco:{task}", recipe, "recurrent", method
                 name = name_run(task, method, seed)
@@ -84,15 +90,17 @@ def name_run(task: str, method: str, seed: int) -> str:
     return f"{task.lower()}_{words}_seed_{seed}"
 
 
-def hand_dataset(task: str) -> Path:
-    """Return the folder of the demonstrations with the dynamics of the hand alone."""
-    return Path("datasets") / f"{re.sub('(?<=[a-z])(?=[A-Z])', '_', task).lower()}_hand"
+def derived_dataset(task: str, method: str) -> Path:
+    """Return the folder of the demonstrations of a task with derived dynamics."""
+    name = re.sub("(?<=[a-z])(?=[A-Z])", "_", task).lower()
+    return Path("datasets") / f"{name}_{DERIVED[method][0]}"
 
 
-def make_hand_dataset(recording: Path, folder: Path) -> None:
-    """Derive a dataset whose dynamics are those of the hand, by differences of ``observation.state``, if it is missing."""
+def derive_dataset(recording: Path, method: str, folder: Path) -> None:
+    """Derive a dataset from a recording if it is missing; ``NAME.quality.json`` beside it has its quality."""
     if not folder.exists():
-        add_dynamics(recording, folder, columns=[0, 1, 2], replace=True)
+        found = add_dynamics(recording, folder, **DERIVED[method][1], replace=True)
+        write_json(folder.with_name(f"{folder.name}.quality.json"), found["quality"])
 
 
 def read_benchmarks(results: Path) -> dict[tuple[str, str], list[dict]]:

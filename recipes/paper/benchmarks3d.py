@@ -6,8 +6,8 @@
     python recipes/paper/benchmarks3d.py --write                      # the page from the results alone
 
 A cell is a run of another recipe for one task, method and seed, and its result a JSON file; cells with a result are skipped.
-The same command resumes a stopped grid, and every cell. One row has the dynamics of the hand alone, in datasets/TASK_hand,
-which are derived from the recordings. The page has success, failures by cause, and animations. Needs pip install '.[lerobot,mujoco]'.
+The same command resumes a stopped grid, and every cell. Two rows have dynamics that are derived from
+the recordings, in datasets/TASK_hand and datasets/TASK_tracks. The page has success, failures by cause, and animations. Needs pip install '.[lerobot,mujoco]'.
 """
 
 import json
@@ -51,7 +51,7 @@ class Config:
 
 def main(config: Config) -> None:
     """Run the cells without a result, and write the page."""
-    from dynmap_rl.paper.benchmarks import list_benchmarks, make_hand_dataset
+    from dynmap_rl.paper.benchmarks import derive_dataset, list_benchmarks
     from dynmap_rl.paper.launch import execute, is_done, launch, print_runs
 
     if config.write:
@@ -67,7 +67,7 @@ def main(config: Config) -> None:
     recordings = {task: find_or_record(task) for task in sorted({cell.task for cell in todo})}
     for cell in todo:  # cells must not record or derive at the same time
         if cell.dataset:
-            make_hand_dataset(recordings[cell.task], Path(cell.dataset))
+            derive_dataset(recordings[cell.task], cell.cell[-1], Path(cell.dataset))
     run = partial(
         execute, recipes=RECIPES, results=config.results, runs=config.runs,
         threads=2 if config.workers == 1 else 1, presets=config.presets, root=Path.cwd(),

@@ -13,11 +13,11 @@ from dynmap_rl.paper.benchmarks import (
     benchmark_page,
     benchmark_rows,
     benchmark_table,
+    derive_dataset,
     list_benchmarks,
-    make_hand_dataset,
 )
 from dynmap_rl.utils.cli import parse_settings, read_arguments
-from dynmap_rl.utils.files import write_json
+from dynmap_rl.utils.files import read_json, write_json
 from recipes import baseline, decoupled, end_to_end
 
 
@@ -79,7 +79,8 @@ def test_dynamics_of_the_hand_are_its_recorded_positions(tmp_path):
     check_renderer()
     record_dataset(tmp_path / "plate_slide", "mujoco:PlateSlide", episodes=1, eval_episodes=1, workers=1)
     for _ in range(2):  # the second time, it is there
-        make_hand_dataset(tmp_path / "plate_slide", tmp_path / "hand")
+        derive_dataset(tmp_path / "plate_slide", "RGB+[P+V] of the hand", tmp_path / "hand")
+    assert read_json(tmp_path / "hand.quality.json")["verdict"] in ("good", "doubtful")
     hand, full = (load_dataset(tmp_path / name, "train") for name in ("hand", "plate_slide"))
     assert hand["dynamics", "position"].shape == (1, 80, 3)
     torch.testing.assert_close(hand["dynamics", "position"], full["dynamics", "position"][..., -3:])
