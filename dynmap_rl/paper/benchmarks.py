@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from pathlib import Path
+from statistics import fmean
 
 from dynmap_rl.data.derive import add_dynamics
 from dynmap_rl.evaluation.protocol import result_rows
@@ -54,6 +55,8 @@ other failures the cause is where the object is in the last frame, as seen from 
 
 {failures}
 
+Mean distance of the object's predicted and true positions in these episodes, one step ahead: {localization}.
+
 ## Episodes
 
 Eight episodes of the first seed, failures first. At most four are failures if four others succeeded.
@@ -61,6 +64,8 @@ Eight episodes of the first seed, failures first. At most four are failures if f
 {animations}
 
 ## Commands
+
+`python recipes/paper/benchmarks3d.py --only NAME` also records and derives the dataset of a run.
 
 ```bash
 {commands}
@@ -124,7 +129,8 @@ def benchmark_rows(results: Path) -> list[dict]:
 
     Returns:
         Dicts with ``task``, ``method``, ``seeds``, ``episodes``, ``SR``, ``SR_interval``, ``DR``, ``DR_interval`` (%),
-        ``PE`` (mm), ``rates`` (SR of each seed), ``causes`` (number of failed episodes by cause), ``commands`` and
+        ``PE`` (mm), ``localization`` (mm; None if the world model does not predict the object's position), ``rates`` (SR of
+        each seed), ``causes`` (number of failed episodes by cause), ``commands`` and
         ``commits``. Intervals count with start states that the seeds share.
 
     Raises:
@@ -144,6 +150,7 @@ def benchmark_rows(results: Path) -> list[dict]:
                 **{name: summary[name] for name in ("episodes", "SR", "DR", "PE")},
                 "SR_interval": shared_interval(rows),
                 "DR_interval": shared_interval(rows, "dropped"),
+                "localization": fmean(errors) if (errors := _localization(cells)) else None,
                 "rates": [summarize(part)["SR"] for part in rows],
                 "causes": summary.get("causes", {}),
                 "commands": [cell["command"] for cell in cells],
@@ -151,6 +158,11 @@ def benchmark_rows(results: Path) -> list[dict]:
             }
         )
     return table
+
+
+def _localization(cells: list[dict]) -> list[float]:
+    summaries = [cell.get("test_protocol", {}) for cell in cells]
+    return [summary["localization"] for summary in summaries if "localization" in summary]
 
 
 def benchmark_table(rows: list[dict], experts: dict[str, dict] | None = None) -> str:
@@ -182,6 +194,11 @@ def benchmark_page(rows: list[dict], folder: Path) -> str:
         for title, row in zip(titles, rows, strict=True)
         if (folder / (name := f"{name_run(row['task'], row['method'], SEEDS[0])}.gif")).exists()
     ]
+    distances = [
+        f"{title} {row['localization']:.0f} mm"
+        for title, row in zip(titles, rows, strict=True)
+        if row["localization"] is not None
+    ]
     experts = read_experts(folder)
     commands = [result["command"] for result in experts.values()]
     commands += [command for row in rows for command in row["commands"]]
@@ -191,6 +208,7 @@ def benchmark_page(rows: list[dict], folder: Path) -> str:
         failures=cause_table(
             (t, row["episodes"], row["causes"]) for t, row in zip(titles, rows, strict=True)
         ),
+        localization=", ".join(distances) or "not measured",
         animations="\n\n".join(animations),
         commands="\n".join(commands),
     )

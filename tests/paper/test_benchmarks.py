@@ -28,7 +28,13 @@ def make_result(success, first=0):
         for i, good in enumerate(success)
     ]
     result = {"test": {"rows": pack_rows(values)}}
-    return {"command": "python recipes/x.py", "commit": "abc-dirty", "results": [result]}
+    summary = {"localization": 10.0 + first}
+    return {
+        "command": "python recipes/x.py",
+        "commit": "abc-dirty",
+        "results": [result],
+        "test_protocol": summary,
+    }
 
 
 def test_every_cell_is_a_command_that_its_recipe_understands():
@@ -55,7 +61,7 @@ def test_the_table_has_what_the_results_have(tmp_path):
     assert row["SR"] == 62.5 and row["SR_interval"][0] < 62.5 < row["SR_interval"][1]
     table = benchmark_table([row])
     assert "62.5" in table and "2 of 3 seeds" in table and all(method in table for method in METHODS)
-    assert row["rates"] == [75, 50] and row["causes"] == {"overshoots": 3}
+    assert row["localization"] == 10 and row["rates"] == [75, 50] and row["causes"] == {"overshoots": 3}
     (tmp_path / "soccer_rgb_p_seed_0.gif").touch()
     expert = {"rates": {"success": 98.0}, "intervals": {"success": [96.0, 99.0]}, "command": "python y.py"}
     write_json(tmp_path / "expert_soccer.json", expert)
