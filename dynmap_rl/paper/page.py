@@ -31,6 +31,7 @@ the column says how those were trained.
 - [`cells/`](cells): for every run settings, command, commit, fingerprint of the frozen weights and the outcome of every
   episode
 - [`delays/`](delays/README.md): success against the delay of the frames
+- [`benchmarks3d/`](benchmarks3d/README.md): the MuJoCo tasks
 - [`sources_plain/`](sources_plain/README.md): success against the source of the dynamics, with the paper's plain CNN
 - [`measurements/`](measurements): other measurements
 - [`media/`](media): figures and animations
