@@ -82,7 +82,7 @@ def main(config: Config) -> None:
 
 def write(config: Config) -> None:
     """Write ``README.md`` and ``table.json`` from the results, and print the table."""
-    from dynmap_rl.paper.benchmarks import benchmark_page, benchmark_rows, benchmark_table
+    from dynmap_rl.paper.benchmarks import benchmark_page, benchmark_rows, benchmark_table, read_experts
     from dynmap_rl.utils.files import write_bytes
 
     rows = benchmark_rows(config.results)
@@ -91,7 +91,7 @@ def write(config: Config) -> None:
     write_bytes(config.results / "README.md", benchmark_page(rows, config.results).encode())
     write_bytes(config.results / "table.json", json.dumps(rows, indent=1).encode())
     print(
-        f"{benchmark_table(rows)}\nwritten: {config.results / 'README.md'}, {config.results / 'table.json'}"
+        f"{benchmark_table(rows, read_experts(config.results))}\nwritten: {config.results / 'README.md'}, {config.results / 'table.json'}"
     )
 
 
