@@ -10,7 +10,7 @@ from dynmap_rl.keys import DYNAMICS
 from dynmap_rl.modules.world_model import WorldModel
 
 STATES = "latent", "hidden1", "hidden2"
-GOOD = 0.8  # R^2 of the velocities
+GOOD = 0.75  # R^2 of the velocities
 
 
 @torch.no_grad()
@@ -43,15 +43,16 @@ def probe(world_model: WorldModel, train: TensorDictBase, test: TensorDictBase) 
 def judge_states(probed: dict[str, dict]) -> dict:
     """Judge a world model by the velocities that a linear map reads from its best state, without a policy.
 
-    On task 1, with 300 demonstrations, the paper's plain CNN and one world model for each of seven sources of dynamics,
-    recurrent policies on those with an R^2 of 0.80 and more succeed in at least 96.0 % of the scenes, and on the two with less (0.66 and 0.50) in
-    77.2 and 47.1 % (``recipes/results/sources_plain``). Other tasks have not been measured.
+    On task 1, with 300 demonstrations, the paper's plain CNN and one world model for each of eight sources of dynamics,
+    R^2 ranks the world models like the success of recurrent policies (rank correlation 0.98): those with 0.79 and more
+    succeed in at least 95.3 % of the scenes, the two with less (0.66 and 0.50) in 77.2 and 47.1 %
+    (``recipes/results/sources_plain``). Other tasks have not been measured.
 
     Args:
         probed: result of :func:`probe`.
 
     Returns:
-        ``verdict`` (``good`` from an R^2 of 0.8 on, or ``doubtful``), the best ``state``, and its mean ``r2``.
+        ``verdict`` (``good`` from an R^2 of 0.75 on, or ``doubtful``), the best ``state``, and its mean ``r2``.
     """
     means = {state: sum(found["velocity"]) / len(found["velocity"]) for state, found in probed.items()}
     state = max(means, key=means.get)
