@@ -27,7 +27,7 @@ def test_the_best_state_decides():
     def explain(*values):
         return {"velocity": list(values), "position": [1.0, 1.0]}
 
-    good = {"latent": explain(0.1, 0.2), "hidden1": explain(0.72, 0.8), "hidden2": explain(1.0, 0.5)}
+    good = {"latent": explain(0.1, 0.2), "hidden1": explain(0.72, 0.8), "hidden2": explain(1.0, 0.4)}
     found = probing.judge_states(good)
     assert (found["verdict"], found["state"], round(found["r2"], 3)) == ("good", "hidden1", 0.76)
     assert probing.judge_states(good | {"hidden1": explain(0.72, 0.75)})["verdict"] == "doubtful"
