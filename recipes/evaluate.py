@@ -8,8 +8,9 @@
     python recipes/evaluate.py --expert careless                                     # ignores the block
 
 A policy acts on frames in closed loop; the result is drop rate, position error, success rate, and the number of failures
-by cause. An expert acts on states; the result is the rates of success, drops and touches, and for task 2 how often the straight path to the goal is
-blocked, and the shortest one leads around it. Rates have 95 % Wilson intervals. runs/evaluate gets numbers and a page.
+by cause. An expert acts on states; the result is the rates of success, drops and touches, and for task 2 how often the
+straight path to the goal is blocked, and the shortest one leads around it. Rates have 95 % Wilson intervals. runs/evaluate
+gets numbers and a page.
 """
 
 import sys

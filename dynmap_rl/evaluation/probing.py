@@ -26,7 +26,8 @@ def probe(world_model: WorldModel, train: TensorDictBase, test: TensorDictBase) 
 
     Returns:
         For each of ``latent``, ``hidden1``, ``hidden2`` and each quantity a list of R^2, one for each entry (cart x, y,
-        theta, block x, y, theta): 1 is a perfect map, 0 as good as the mean. Steps t = 0, at which memory is empty, are left out.
+        theta, block x, y, theta): 1 is a perfect map, 0 as good as the mean. Steps t = 0, at which memory is empty, are
+        left out.
     """
     inputs = [_states(world_model, episodes) for episodes in (train, test)]
     targets = [

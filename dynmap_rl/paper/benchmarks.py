@@ -13,16 +13,14 @@ from dynmap_rl.evaluation.statistics import shared_interval, summarize
 from dynmap_rl.utils.files import read_json, write_json
 
 from .cells import Run
+from .sources import quality_file
 from .tables import cause_table, commits_text, join_table
 
 TASKS = "FetchPush", "FetchSlide", "PlateSlide", "Soccer"
 SEEDS = 0, 1, 2  # of weights and batches, of world models and policies
 DERIVED = {  # rows whose dynamics need no simulator: name of their dataset, and how its columns are derived
     "RGB+[P+V] of the hand": ("hand", {"columns": [0, 1, 2]}),  # of its recorded positions
-    "RGB+[P+V], tracked": (
-        "tracks",
-        {"source": "tracks", "objects": 2},
-    ),  # of the object and the hand in the frames
+    "RGB+[P+V], tracked": ("tracks", {"source": "tracks", "objects": 2}),  # of object and hand, in the frames
 }
 METHODS = {  # by the row of the table: recipe and its options
     "Only-RGB": ("decoupled", ("--world_model.supervision", "none")),
@@ -45,7 +43,7 @@ nothing about further trainings. Tasks, cameras and experts are described in
 
 {table}
 
-Runs by commit: {commits}.
+Runs by commit: {commits}. A run that was resumed names the commit at its end.
 
 ## What fails
 
@@ -105,7 +103,7 @@ def derive_dataset(recording: Path, method: str, folder: Path) -> None:
     """Derive a dataset from a recording if it is missing; ``NAME.quality.json`` beside it has its quality."""
     if not folder.exists():
         found = add_dynamics(recording, folder, **DERIVED[method][1], replace=True)
-        write_json(folder.with_name(f"{folder.name}.quality.json"), found["quality"])
+        write_json(quality_file(folder), found["quality"])
 
 
 def read_benchmarks(results: Path) -> dict[tuple[str, str], list[dict]]:
@@ -130,8 +128,8 @@ def benchmark_rows(results: Path) -> list[dict]:
     Returns:
         Dicts with ``task``, ``method``, ``seeds``, ``episodes``, ``SR``, ``SR_interval``, ``DR``, ``DR_interval`` (%),
         ``PE`` (mm), ``localization`` (mm; None if the world model does not predict the object's position), ``rates`` (SR of
-        each seed), ``causes`` (number of failed episodes by cause), ``commands`` and
-        ``commits``. Intervals count with start states that the seeds share.
+        each seed), ``causes`` (number of failed episodes by cause), ``commands`` and ``commits``. Intervals count with
+        start states that the seeds share.
 
     Raises:
         ValueError: the seeds of a row were evaluated on different scenes.

@@ -222,19 +222,22 @@ def plot_data(results: Path, task: str, path: Path) -> None:
 
 
 def plot_measures(results: Path, task: str, path: Path) -> None:
-    """Draw SR against each cheap measure, with the rank correlation."""
+    """Draw SR against each cheap measure, a colour for each source, with the rank correlation."""
     correlations = rank_correlations(results, task)
-    figure, axes = plt.subplots(1, len(MEASURES), figsize=(11, 3.5), sharey=True, layout="constrained")
+    figure, axes = plt.subplots(1, len(MEASURES), figsize=(11, 3.8), sharey=True, layout="constrained")
+    colors = dict(zip(SOURCES, plt.get_cmap("tab20").colors, strict=False))
     for axis, (measure, (text, _)) in zip(axes, MEASURES.items(), strict=True):
+        title = []
         for policy, marker in zip(POLICIES, "os", strict=True):
-            x, y, names = measured_points(results, task, policy, measure)
-            rho = correlations.get(f"{policy}, {measure}", {}).get("rho")
-            label = policy if rho is None else f"{policy}, rank correlation {rho:.2f}"
-            axis.plot(x, y, marker, ms=4, label=label)
-            for place in zip(x, y, names, strict=True) if policy == "recurrent" else ():
-                axis.annotate(place[2], place[:2], fontsize=7)
+            for x, y, name in zip(*measured_points(results, task, policy, measure), strict=True):
+                label = f"{SOURCES[name].text}, {policy}"
+                axis.plot(x, y, marker, ms=6, color=colors[name], label=label)
+            if found := correlations.get(f"{policy}, {measure}"):
+                title.append(f"{policy}: rank correlation {found['rho']:.2f}")
+        axis.set_title("\n".join(title), fontsize=8)
         axis.set_xlabel(text, fontsize=8)
         axis.grid(alpha=0.3)
-        axis.legend(fontsize=7)
     axes[0].set_ylabel("success [%]", fontsize=8)
+    if axes[-1].lines:
+        axes[-1].legend(fontsize=7, loc="center left", bbox_to_anchor=(1.02, 0.5))
     save_figure(figure, path)

@@ -184,17 +184,18 @@ def make_datasets(cells: list[Run], datasets: Path, workers: int = 1) -> None:
                     found = add_dynamics(recording, folder, **source.columns, replace=True)
                     differences = {q: d.tolist() for q, d in found["differences"].items()}
                     quality = found["quality"] | {"differences": differences}
-                    write_json(_quality_file(folder), quality)
+                    write_json(quality_file(folder), quality)
 
 
 def copy_quality(cells: list[Run], results: Path) -> None:
     """Copy the quality of the cells' derived datasets to ``quality/DATASET.json`` in the folder of the results."""
-    for folder in {Path(cell.dataset) for cell in cells}:
-        if (judged := _quality_file(folder)).exists():
+    for folder in {Path(cell.dataset) for cell in cells if cell.dataset}:
+        if (judged := quality_file(folder)).exists():
             write_json(results / "quality" / f"{folder.name}.json", read_json(judged))
 
 
-def _quality_file(dataset: Path) -> Path:
+def quality_file(dataset: Path) -> Path:
+    """Return the file beside a derived dataset that has the quality of its columns."""
     return dataset.with_name(f"{dataset.name}.quality.json")
 
 

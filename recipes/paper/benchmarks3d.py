@@ -6,8 +6,9 @@
     python recipes/paper/benchmarks3d.py --write                      # the page from the results alone
 
 A cell is a run of another recipe for one task, method and seed, and its result a JSON file; cells with a result are skipped.
-The same command resumes a stopped grid, and every cell. Two rows have dynamics that are derived from
-the recordings, in datasets/TASK_hand and datasets/TASK_tracks. The page has success, failures by cause, and animations. Needs pip install '.[lerobot,mujoco]'.
+The same command resumes a stopped grid, and every cell. Two rows have dynamics that are derived from the recordings, in
+datasets/TASK_hand and datasets/TASK_tracks. The page has success, failures by cause, and animations. Needs
+pip install '.[lerobot,mujoco]'.
 """
 
 import json
@@ -53,6 +54,7 @@ def main(config: Config) -> None:
     """Run the cells without a result, and write the page."""
     from dynmap_rl.paper.benchmarks import derive_dataset, list_benchmarks
     from dynmap_rl.paper.launch import execute, is_done, launch, print_runs
+    from dynmap_rl.paper.sources import copy_quality
 
     if config.write:
         return write(config)
@@ -73,6 +75,7 @@ def main(config: Config) -> None:
         threads=2 if config.workers == 1 else 1, presets=config.presets, root=Path.cwd(),
     )  # fmt: skip
     failed = launch(todo, run, workers=config.workers)
+    copy_quality(cells, config.results)
     copy_pictures(cells, config)
     write(config)
     if failed:
@@ -90,9 +93,8 @@ def write(config: Config) -> None:
         raise ValueError(f"{config.results} must have results; run recipes/paper/benchmarks3d.py first")
     write_bytes(config.results / "README.md", benchmark_page(rows, config.results).encode())
     write_bytes(config.results / "table.json", json.dumps(rows, indent=1).encode())
-    print(
-        f"{benchmark_table(rows, read_experts(config.results))}\nwritten: {config.results / 'README.md'}, {config.results / 'table.json'}"
-    )
+    print(benchmark_table(rows, read_experts(config.results)))
+    print(f"written: {config.results / 'README.md'}, {config.results / 'table.json'}")
 
 
 def copy_pictures(cells: list, config: Config) -> None:
