@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -175,8 +176,8 @@ def demonstrate(task: str, plans: list[Plan]) -> TensorDict:
     Returns:
         ``[E, T]``, as :func:`roll_out` returns them.
     """
-    rules, world, episodes = get_task(task), None, []
-    draw = rules.make_renderer()
+    rules, episodes = get_task(task), []
+    draw, world = _open_simulator(task, type(rules))
     for plan in plans:
         world = rules.begin(plan.scene_seed, None, world)
         rows = list(_demonstrate(rules, draw, world, plan))
@@ -185,6 +186,13 @@ def demonstrate(task: str, plans: list[Plan]) -> TensorDict:
     out = torch.stack(episodes)
     out["pixels"] = out["pixels"].permute(0, 1, 4, 2, 3)
     return out
+
+
+@lru_cache(1)
+def _open_simulator(task: str, kind: type) -> tuple[Callable, SimulatedWorld]:
+    """Return a renderer and a world, which the next recordings of a task use again; loading takes up to a second."""
+    rules = get_task(task)
+    return rules.make_renderer(), rules.begin(0)
 
 
 def _demonstrate(rules: BaseTask, draw: Callable, world: SimulatedWorld, plan: Plan) -> Iterator[dict]:
