@@ -5,7 +5,8 @@
 
 ``ours`` records whole episodes, with resets, expert, dynamics and frames. ``theirs`` takes random actions in the benchmark's
 environment and calls ``env.render()``, at the same size. Both have one thread, one after the other, by the time of the
-processor (which leaves out other load) and by the clock; loading the model, once a process, is left out. Writes ``recipes/results/measurements/recording3d.json``.
+processor (which leaves out other load) and by the clock; loading the model, once a process, is left out. Writes
+``recipes/results/measurements/recording3d.json``.
 """
 
 from __future__ import annotations
