@@ -6,6 +6,7 @@ import torch
 from own_task import check_renderer, own_task, read_code  # noqa: F401
 from torchrl.envs.utils import check_env_specs
 
+from dynmap_rl.data.recording.plans import demonstrate, plan_demonstrations
 from dynmap_rl.envs.protocol import Layout
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
@@ -73,6 +74,17 @@ def test_the_demonstrator_succeeds(own_task):  # noqa: F811
         assert not task.is_over(world)
         task.step([world], [act()])
     assert task.is_success(world) and task.distance(world) == world.position_error < 0.06
+
+
+def check_recordings(task):
+    plans = plan_demonstrations(task, "train", 0, 4)
+    first = demonstrate(task, plans[2:])
+    demonstrate(task, plans[:2])
+    assert (demonstrate(task, plans[2:]) == first).all()  # in a used simulator
+
+
+def test_a_recording_does_not_depend_on_those_before(own_task):  # noqa: F811
+    check_recordings(own_task)
 
 
 def test_arguments_are_a_part_of_the_name(own_task):  # noqa: F811
@@ -145,3 +157,4 @@ def test_the_benchmarks_repeat_bit_by_bit(name):
     _, both = roll(f"mujoco:{name}", [11, 12])
     _, last = roll(f"mujoco:{name}", [12])
     assert (both[1:] == last).all()
+    check_recordings(f"mujoco:{name}")
