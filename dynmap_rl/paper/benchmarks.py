@@ -33,6 +33,10 @@ METHODS = {  # by the row of the table: recipe and its options
     "ACT": ("baseline", ("--policy", "act")),
     "Diffusion Policy": ("baseline", ("--policy", "diffusion")),
 }
+UPDATES = {  # of world models, and of policies; chosen on validation scenes
+    task: ("--world_model.updates", "1800" if task == "Soccer" else "900", "--policy.updates", "4000")
+    for task in TASKS
+}
 
 PAGE = """# MuJoCo tasks
 
@@ -78,7 +82,9 @@ def list_benchmarks(episodes: int = 500) -> dict[tuple[str, str, int], Run]:
         for method, (recipe, options) in METHODS.items():
             for seed in SEEDS:
                 arguments = ["--task", f"mujoco:{task}", *options, "--seeds", str(seed)]
-                arguments += ["--world_model.seed", str(seed)] if recipe == "decoupled" else []
+                arguments += (
+                    ["--world_model.seed", str(seed), *UPDATES[task]] if recipe == "decoupled" else []
+                )
                 arguments += ["--dataset", str(derived_dataset(task, method))] if method in DERIVED else []
                 arguments += ["--eval.episodes", str(episodes), "--eval.paper_episodes", "0"]
                 cell = f"mujoco:{task}", recipe, "recurrent", method

@@ -84,4 +84,7 @@ class Soccer(MetaWorldTask):
     steps = 120
     bodies = (Body("ball", "soccer_ball", "none"), Body("hand", orientation="none"))
     keep = ("soccer_goal",)
-    views = PlateSlide.views
+    views = (  # from the side first: from the front, the goal hides the ball
+        Camera("side", (0.0, 0.74, 0.02), 0.6, 0, -50),
+        Camera("front", (0.0, 0.74, 0.05), 0.65, -90, -50),
+    )
