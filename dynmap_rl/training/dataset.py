@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dynmap_rl.data.demonstrations import META, find_meta
+from dynmap_rl.data.demonstrations import META, find_layout, find_meta
 from dynmap_rl.data.format.reading import find_dataset
 from dynmap_rl.data.recording.record import record_dataset
 from dynmap_rl.data.settings import Augmentation
@@ -37,7 +37,7 @@ def choose_augmentation(task: BaseTask, augmentation: Augmentation) -> Augmentat
 
 
 def check_dataset(dataset: str | Path, task: str) -> None:
-    """Raise ``ValueError`` if a dataset is of another task, or holds exploration instead of demonstrations.
+    """Raise ``ValueError`` if a dataset is of another task or of another form of it, or holds exploration.
 
     A dataset without ``meta/dynmap.json``, such as one that LeRobot's tools have edited, is accepted unchecked.
     """
@@ -51,3 +51,10 @@ def check_dataset(dataset: str | Path, task: str) -> None:
         raise ValueError(
             f"{dataset} holds exploration, which cannot be imitated; choose a --dataset of demonstrations"
         )
+    recorded, own = find_layout(meta).to_dict(), get_task(task).layout.to_dict()
+    for name in ("cameras", "image_size", "fps", "action", "action_limit", "state"):
+        if recorded[name] != own[name]:
+            raise ValueError(
+                f"{dataset} was recorded with {name} {recorded[name]}, but {task} now has {own[name]}; delete the dataset "
+                "to record it again, or choose another --dataset"
+            )

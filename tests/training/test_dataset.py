@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.training import dataset
 from dynmap_rl.training.dataset import check_dataset, find_or_record
 from dynmap_rl.utils.files import read_json, write_json
@@ -38,3 +39,13 @@ def test_a_dataset_of_another_task_is_refused(recording):
     check_dataset(recording, TASK)
     with pytest.raises(ValueError, match="bin_dropping.*balance_reaching"):
         check_dataset(recording, "bin_dropping")
+
+
+def test_a_dataset_of_other_cameras_is_refused(recording, tmp_path):
+    """Otherwise a policy would be trained on other frames than it is evaluated on."""
+    shutil.copytree(recording, tmp_path / "recording")
+    path = tmp_path / "recording/meta/dynmap.json"
+    layout = get_task(TASK).layout.to_dict() | {"cameras": ["side"]}
+    write_json(path, read_json(path) | {"layout": layout})
+    with pytest.raises(ValueError, match="cameras.*side.*front"):
+        check_dataset(tmp_path / "recording", TASK)
