@@ -3,10 +3,10 @@
     uv run --extra mujoco python tests/benchmarks/recording3d.py
     uv run --extra mujoco python tests/benchmarks/recording3d.py --tasks Soccer --episodes 5 --output found.json
 
-``ours`` records whole episodes, with resets, expert, dynamics and frames. ``theirs`` takes random actions in the benchmark's
-environment and calls ``env.render()``, at the same size. Both have one thread, one after the other, by the time of the
-processor (which leaves out other load) and by the clock; loading the model, once a process, is left out. Writes
-``recipes/results/measurements/recording3d.json``.
+``ours`` records a dataset, with resets, failures of the expert, dynamics, frames and files. ``theirs`` takes random actions
+in the benchmark's environment and calls ``env.render()``, at the same size. Both have one thread, one after the other, by
+the time of the processor (which leaves out other load) and by the clock; loading the model, once a process, is left out.
+Writes ``recipes/results/measurements/recording3d.json``.
 """
 
 from __future__ import annotations
@@ -19,13 +19,12 @@ from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import gymnasium
-import torch
 
-from dynmap_rl.data.recording.plans import SCRIPTED, Plan, demonstrate
+from dynmap_rl.data.recording.shards import Shard, record_shard
 from dynmap_rl.envs.tasks import get_task
-from dynmap_rl.evaluation.rollout import scene_seeds
 from dynmap_rl.paper.benchmarks import TASKS
 from dynmap_rl.utils.cli import command_line
 from dynmap_rl.utils.files import write_json
@@ -59,11 +58,20 @@ def make_theirs(task: str) -> gymnasium.Env:
 
 
 def record(task: str, episodes: int) -> dict[str, float]:
-    """Measure whole demonstrations."""
-    torch.set_num_threads(1)
-    name, plans = f"mujoco:{task}", [Plan(seed, SCRIPTED) for seed in scene_seeds("validation", episodes)]
-    demonstrate(name, plans[:1])  # loads models and libraries
-    return measure(lambda: demonstrate(name, plans)["action"].shape[:2].numel())
+    """Measure a part of a dataset, as one process records it."""
+    name = f"mujoco:{task}"
+    with TemporaryDirectory() as folder:
+        shards = [
+            Shard(Path(folder, str(number)), name, name, "demonstrations", "validation", number, count)
+            for number, count in enumerate((1, episodes))
+        ]
+        record_shard(shards[0])  # loads models and libraries
+
+        def run() -> int:
+            record_shard(shards[1])
+            return episodes * get_task(name).layout.steps
+
+        return measure(run)
 
 
 def render(task: str, frames: int) -> dict[str, float]:
