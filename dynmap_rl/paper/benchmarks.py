@@ -33,9 +33,8 @@ METHODS = {  # by the row of the table: recipe and its options
     "ACT": ("baseline", ("--policy", "act")),
     "Diffusion Policy": ("baseline", ("--policy", "diffusion")),
 }
-UPDATES = {  # of world models, and of policies; chosen on validation scenes
-    task: ("--world_model.updates", "1800" if task == "Soccer" else "900", "--policy.updates", "4000")
-    for task in TASKS
+UPDATES = {  # of world models and policies, in the place of the defaults; chosen on validation scenes
+    "Soccer": ("--world_model.updates", "1800", "--policy.updates", "4000"),
 }
 
 PAGE = """# MuJoCo tasks
@@ -82,9 +81,8 @@ def list_benchmarks(episodes: int = 500) -> dict[tuple[str, str, int], Run]:
         for method, (recipe, options) in METHODS.items():
             for seed in SEEDS:
                 arguments = ["--task", f"mujoco:{task}", *options, "--seeds", str(seed)]
-                arguments += (
-                    ["--world_model.seed", str(seed), *UPDATES[task]] if recipe == "decoupled" else []
-                )
+                if recipe == "decoupled":
+                    arguments += ["--world_model.seed", str(seed), *UPDATES.get(task, ())]
                 arguments += ["--dataset", str(derived_dataset(task, method))] if method in DERIVED else []
                 arguments += ["--eval.episodes", str(episodes), "--eval.paper_episodes", "0"]
                 cell = f"mujoco:{task}", recipe, "recurrent", method
