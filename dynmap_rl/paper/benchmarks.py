@@ -34,6 +34,7 @@ METHODS = {  # by the row of the table: recipe and its options
     "Diffusion Policy": ("baseline", ("--policy", "diffusion")),
 }
 UPDATES = {  # of world models and policies, in the place of the defaults; chosen on validation scenes
+    "FetchPush": ("--policy.updates", "4000"),
     "Soccer": ("--world_model.updates", "1800", "--policy.updates", "4000"),
 }
 
