@@ -83,9 +83,8 @@ class _Images(list):
         self.pixels = frames.transpose(0, 3, 1, 2)
         for t, frame in enumerate(frames):
             file = io.BytesIO()
-            Image.fromarray(frame).save(
-                file, "PNG", compress_level=1
-            )  # LeRobot's 6 takes up to three times as long
+            # LeRobot's level 6 takes up to three times as long.
+            Image.fromarray(frame).save(file, "PNG", compress_level=1)
             self.append({"bytes": file.getvalue(), "path": IMAGE_FILE_PATTERN.format(frame_index=t)})
 
 
