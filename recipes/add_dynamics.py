@@ -2,6 +2,7 @@
 
     python recipes/add_dynamics.py --dataset user/name --columns 0,1,2 --angles 2 --output datasets/name
     python recipes/add_dynamics.py --dataset user/name --source tracks --objects 2 --output datasets/name
+    python recipes/add_dynamics.py --dataset user/name --source state,tracks --colors red --output datasets/name
     python recipes/add_dynamics.py --dataset datasets/balance_reaching --source tracks --replace --output datasets/tracks
 
 World models are supervised on the columns dynamics.position, .velocity and .acceleration (see recipes/robot.py). The
@@ -26,7 +27,8 @@ class Config:
     # Folder of the new dataset. Required.
     output: Path | None = None
     # Source of the positions: state (a column), or the frames: centroid (of all that moves), tracks (objects with angles)
-    # or flow (tracks, with velocities by optical flow). Limits: dynmap_rl/data/README.md.
+    # or flow (tracks, with velocities by optical flow), or both: state,tracks or state,flow. Limits:
+    # dynmap_rl/data/README.md.
     source: str = "state"
     # Column whose entries are positions.
     state: str = "observation.state"
@@ -53,10 +55,14 @@ class Config:
     camera: str | None = None
     # Number of objects, for tracks and flow; by default two for a recording of cart and block, otherwise one.
     objects: int | None = None
-    # Difference of a colour channel, 0 to 255, from which on a pixel counts as moving.
+    # Colours of the objects, names or #rrggbb, in the place of objects and sort: #1c1c1c,red.
+    colors: str | None = None
+    # Difference of a colour channel, 0 to 255, from which on a pixel counts as moving, and colours as different.
     threshold: int = 30
     # Order of the objects: lowest (at first), largest or brightest one first; it must be the same in all episodes.
     sort: str = "lowest"
+    # Leave the angles of tracked objects out, as for round ones.
+    point: bool = False
     # Width of the picture in m; by default 1 for a recording of cart and block, otherwise positions are in pixels.
     width: float | None = None
     # Replace existing dynamics columns, and print how far the new ones differ.
@@ -65,8 +71,9 @@ class Config:
 
 def main(config: Config) -> None:
     """Derive the columns and report."""
-    from dynmap_rl.data.derive import add_dynamics, parse_entries
+    from dynmap_rl.data.derive import add_dynamics
     from dynmap_rl.data.quality import quality_text, worst_episode
+    from dynmap_rl.data.state import parse_entries
     from dynmap_rl.reporting.dataset_page import write_dataset_page
     from dynmap_rl.reporting.track_figure import plot_tracks
     from dynmap_rl.runs.folder import plain_settings
@@ -74,17 +81,14 @@ def main(config: Config) -> None:
 
     if not config.dataset or not config.output:
         raise ValueError("--dataset and --output must be given: the dataset, and the folder of the new one")
-    if config.source == "state":
-        names, other = ("camera", "objects", "threshold", "sort", "width"), "--source state"
-    else:
-        names, other = (
-            ("state", "columns", "angles", "period", "noise", "angle_noise"),
-            f"--source {config.source}",
-        )
-    refuse(config, Config(), names, other)
+    of_state = "state", "columns", "angles", "period", "noise", "angle_noise"
+    of_frames = "camera", "objects", "colors", "threshold", "sort", "point", "width"
+    unused = {"state": of_frames, "centroid": of_state, "tracks": of_state, "flow": of_state}
+    refuse(config, Config(), unused.get(config.source, ()), f"--source {config.source}")
     settings = vars(config) | {
         "columns": parse_entries(config.columns, "--columns"),
         "angles": parse_entries(config.angles, "--angles") or [],
+        "colors": config.colors.split(",") if config.colors else None,
     }
     found = add_dynamics(**settings)
     print(f"written: {config.output}")
@@ -99,7 +103,7 @@ def main(config: Config) -> None:
     differences = {q: difference.tolist() for q, difference in found["differences"].items()}
     write_json(folder / "quality.json", found["quality"] | {"differences": differences, "command": command})
     (folder / "tracks.png").unlink(missing_ok=True)  # of another source
-    if config.source in ("tracks", "flow"):
+    if config.source.endswith(("tracks", "flow")):
         plot_tracks(config.dataset, found["view"], worst_episode(found["quality"]), folder / "tracks.png")
     write_dataset_page(folder, config.output, plain_settings(config), command, text)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from .format.reading import find_dataset, read_column, read_info, read_table, sp
 from .normalization import planar_range, value_range
 from .quality import Derived, judge_quality
 from .sources import SOURCES, Motion, choose_view, read_motion
+from .state import choose_state, read_state
 
 METHODS = ("central", "savgol")
 
@@ -84,8 +85,10 @@ def add_dynamics(
     order: int = 3,
     camera: str | None = None,
     objects: int | None = None,
+    colors: Sequence[str] | None = None,
     threshold: int = 30,
     sort: str = "lowest",
+    point: bool = False,
     width: float | None = None,
     replace: bool = False,
 ) -> dict:
@@ -100,7 +103,7 @@ def add_dynamics(
         dataset: local folder or hub id.
         output: the new folder.
         source: ``state``, or from the frames ``centroid``, ``tracks`` or ``flow`` (see
-            :class:`dynmap_rl.data.sources.Camera`).
+            :class:`dynmap_rl.data.sources.Camera`), or both: ``state,tracks`` or ``state,flow``.
         state: column whose entries are positions. They stay as measured, except for unwrapped angles.
         columns: entries of that column; by default all.
         angles: entries among ``columns`` that are angles and jump by ``period``.
@@ -115,8 +118,10 @@ def add_dynamics(
         camera: column of the frames; by default the first camera.
         objects: number of objects in the frames, for ``tracks`` and ``flow``; by default the number of bodies of a task
             in the plane, otherwise one.
-        threshold: smallest difference of a colour channel of a pixel that moves.
+        colors: colour of each object, such as ``"#1c1c1c"`` or ``"red"``, in the place of ``objects`` and ``sort``.
+        threshold: smallest difference of a colour channel of a pixel that moves, and of two colours.
         sort: order of the objects (see :func:`dynmap_rl.data.tracking.track_objects`).
+        point: leave the angles of tracked objects out.
         width: width of the picture (m); by default 1 for a task in the plane, otherwise positions are in pixels.
         replace: replace existing dynamics columns.
 
@@ -135,41 +140,36 @@ def add_dynamics(
         raise ValueError(f"{root} must not have {', '.join(old)}; replace them with --replace")
     _check_output(root, output)
     if source not in SOURCES:
-        raise ValueError(f"--source must be one of {', '.join(SOURCES)}, got {source!r}")
-    method = method or ("central" if source == "state" else "savgol")
+        raise ValueError(f"--source must be one of {' '.join(SOURCES)}, got {source!r}")
     _check_method(method, window, order)
     planar = meta is not None and _is_planar(meta["task"])
-    if source == "state":
-        if noise < 0 or angle_noise < 0:
-            raise ValueError(f"--noise and --angle_noise must be at least 0, got {noise} and {angle_noise}")
-        columns = _check_columns(root, info, state, columns, angles)
-        names, view = [entry_names(info, state)[i] for i in columns], None
-        angles = [columns.index(i) for i in angles]
-        motions = _read_state(root, info, state, columns, angles, period, (noise, angle_noise, noise_seed))
-    else:
-        frames = {"camera": camera, "objects": objects, "threshold": threshold, "sort": sort, "width": width}
-        view = choose_view(root, info, source, planar, **frames)
-        names, motions = view.names, read_motion(root, info, view)
-        if planar and view.objects == len(BODIES) // 3 and source != "centroid":
-            names = list(BODIES)
+    parts, view = [], None  # names, motions by episode, and method
+    if "state" in source:
+        entries = choose_state(info, state, columns, angles, period, noise, angle_noise, noise_seed)
+        parts.append((entries.names, read_state(root, info, entries), method or "central"))
+    if source != "state":
+        frames = {"camera": camera, "objects": objects, "colors": colors, "threshold": threshold}
+        frames |= {"sort": sort, "point": point, "width": width}
+        view = choose_view(root, info, source.removeprefix("state,"), planar, **frames)
+        parts.append((view.names, read_motion(root, info, view), method or "savgol"))
+    names = [name for part in parts for name in part[0]]
+    if planar and source in ("tracks", "flow") and len(names) == len(BODIES):
+        names = list(BODIES)
+        parts = [(names, *parts[0][1:])]
     table = read_table(root, info, ["timestamp", *old])
     time = read_column(root, info, table, "timestamp", np.float64).numpy()[:, 0]
     rows = dict(spans(table["episode_index"].to_numpy()))
-    values, derived = {q: np.empty((len(table), len(names))) for q in DYNAMICS}, []
-    for episode, motion in motions:
-        own = motion.position
-        own[:, motion.angles] = np.unwrap(own[:, motion.angles], axis=0, period=motion.period)
-        try:
-            velocity, acceleration = differentiate(own, time[rows[episode]], method, window, order)
-            if motion.velocity is not None:
-                motion = dataclasses.replace(motion, other=velocity)
-                velocity = motion.velocity
-                acceleration = differentiate(velocity, time[rows[episode]], method, window, order)[0]
-        except ValueError as error:
-            raise ValueError(f"{root}: episode {episode} {error}") from error
-        for quantity, part in zip(DYNAMICS, (own, velocity, acceleration), strict=True):
-            values[quantity][rows[episode]] = part
-        derived.append(Derived(episode, own, velocity, motion.light()))
+    values, derived, start = {q: np.empty((len(table), len(names))) for q in DYNAMICS}, [], 0
+    for own_names, motions, own_method in parts:
+        entries = slice(start, start := start + len(own_names))
+        for episode, motion in motions:
+            try:
+                found, motion = _derive(motion, time[rows[episode]], own_method, window, order)
+            except ValueError as error:
+                raise ValueError(f"{root}: episode {episode} {error}") from error
+            for quantity, part in found.items():
+                values[quantity][rows[episode], entries] = part
+            derived.append(Derived(episode, own_names, found["position"], found["velocity"], motion))
     new = {f"dynamics.{q}": v.astype(np.float32) for q, v in values.items()}
     meta = _describe(meta, planar, names, values, rows) if meta else None
     write_columns(root, output, info, table, new, names, {META: meta})
@@ -179,26 +179,21 @@ def add_dynamics(
         if f"dynamics.{q}" in old
     }
     differences = {q: np.abs(values[q] - v).mean(0) for q, v in there.items() if v.shape == values[q].shape}
-    return {"differences": differences, "quality": judge_quality(derived, names), "view": view}
+    return {"differences": differences, "quality": judge_quality(derived), "view": view}
 
 
-def _read_state(
-    root: Path,
-    info: dict,
-    state: str,
-    columns: list[int],
-    angles: list[int],
-    period: float,
-    noise: tuple[float, float, int],
-) -> Iterator[tuple[int, Motion]]:
-    """Iterate over the episodes' positions in a column, with noise on lengths and angles."""
-    table = read_table(root, info, [state])
-    position = read_column(root, info, table, state, np.float64).numpy()[:, columns]
-    *sizes, seed = noise
-    scale = np.where(np.isin(np.arange(len(columns)), angles), sizes[1], sizes[0])
-    position += scale * np.random.default_rng(seed).standard_normal(position.shape)
-    for episode, rows in spans(table["episode_index"].to_numpy()):
-        yield episode, Motion(position[rows], angles, period)
+def _derive(
+    motion: Motion, time: np.ndarray, method: str, window: int, order: int
+) -> tuple[dict[str, np.ndarray], Motion]:
+    """Return position, velocity and acceleration of an episode, with angles unwrapped, and what was measured."""
+    position = motion.position
+    position[:, motion.angles] = np.unwrap(position[:, motion.angles], axis=0, period=motion.period)
+    velocity, acceleration = differentiate(position, time, method, window, order)
+    if motion.velocity is not None:
+        motion = dataclasses.replace(motion, other=velocity)
+        velocity = motion.velocity
+        acceleration = differentiate(velocity, time, method, window, order)[0]
+    return {"position": position, "velocity": velocity, "acceleration": acceleration}, motion.light()
 
 
 def _is_planar(task: str) -> bool:
@@ -224,32 +219,6 @@ def _describe(
     return rest | layout | {"normalization": meta["normalization"] | ranges}
 
 
-def parse_entries(text: str | None, option: str) -> list[int] | None:
-    """Read a text such as ``0,2`` as numbers; None stays None.
-
-    Args:
-        text: the text.
-        option: name of the option, for the message.
-
-    Raises:
-        ValueError: the text is not a list of whole numbers.
-    """
-    try:
-        return None if text is None else [int(entry) for entry in text.split(",")]
-    except ValueError as error:
-        raise ValueError(f"{option} must be whole numbers such as 0,1,2, got {text!r}") from error
-
-
-def entry_names(info: dict, column: str) -> list[str]:
-    """Return a name for every entry of a column: the dataset's own names, or numbers where it has none."""
-    feature = info["features"][column]
-    size, names = math.prod(feature["shape"]), feature.get("names")
-    if isinstance(names, dict):  # by groups, as in {"motors": [...]}
-        names = [name for group in names.values() if isinstance(group, list) for name in group]
-    named = isinstance(names, list) and len(names) == size
-    return [str(name) for name in names] if named else [str(i) for i in range(size)]
-
-
 def _check_output(root: Path, output: Path) -> None:
     if output.exists():
         raise ValueError(
@@ -259,25 +228,10 @@ def _check_output(root: Path, output: Path) -> None:
         raise ValueError(f"--output must be outside of the dataset, got {output}; choose another")
 
 
-def _check_method(method: str, window: int, order: int) -> None:
-    if method not in METHODS:
+def _check_method(method: str | None, window: int, order: int) -> None:
+    if method not in (None, *METHODS):
         raise ValueError(f"--method must be one of {', '.join(METHODS)}, got {method!r}")
-    if method == "savgol" and not (window % 2 and 2 <= order < window):
+    if method != "central" and not (window % 2 and 2 <= order < window):
         raise ValueError(
             f"--window must be odd and --order at least 2 and below --window, got {window} and {order}"
         )
-
-
-def _check_columns(root: Path, info: dict, state: str, columns, angles) -> list[int]:
-    features = info["features"]
-    numbers = ("float32", "float64")
-    vectors = [n for n, f in features.items() if f["dtype"] in numbers and len(f["shape"]) == 1]
-    if state not in vectors:
-        raise ValueError(f"--state must be a column of numbers, one of {', '.join(vectors)}, got {state!r}")
-    size = features[state]["shape"][0]
-    columns = list(range(size) if columns is None else columns)
-    if not columns or len(set(columns)) < len(columns) or not all(0 <= i < size for i in columns):
-        raise ValueError(f"--columns must be different entries of {state}, 0 to {size - 1}, got {columns}")
-    if unknown := [i for i in angles if i not in columns]:
-        raise ValueError(f"--angles must be among --columns {columns}, got {unknown}")
-    return columns

@@ -1,8 +1,8 @@
 """Quality of derived dynamics columns, estimated without the truth, and what to film differently.
 
 Every check has a value, a limit, and advice. The limits (:data:`LIMITS`) were chosen by hand. They tell synthetic films and
-positions with one known fault from those without (``tests/data/test_quality.py``); whether they predict the success of a
-policy has not been measured.
+positions with one known fault from those without (``tests/data/test_quality.py``). Success beside verdicts:
+``dynmap_rl/data/README.md``.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ SMOOTH = 7, 2  # window and order of the smooth trajectory
 LIMITS = {
     "lost": (
         0.05, True, "share of the frames in which an object is not found",
-        "keep the object in view and unlike its surroundings in colour, or choose another --objects or --threshold",
+        "keep the object in view and unlike its surroundings in colour, or choose its --colors, --objects or --threshold",
     ),
     "cut": (
         0.05, True, "share of the frames in which an object touches the border of the picture",
@@ -48,7 +48,7 @@ LIMITS = {
     ),
     "residual_angle": (
         0.07, True, "distance of an angle from a smooth trajectory, root mean square (rad)",
-        "use --method savgol with a longer --window, or leave the angle out; a round or small object has none",
+        "use --method savgol with a longer --window, or --point true for tracks without angles: a round object has none",
     ),
     "agreement": (
         0.7, False, "correlation of the tracks' velocity with that of the optical flow",
@@ -59,37 +59,42 @@ LIMITS = {
 
 @dataclass(frozen=True)
 class Derived:
-    """Dynamics of an episode as they are written.
+    """Dynamics of an episode from one source as they are written.
 
     Attributes:
         episode: index of the episode.
+        names: names of the D entries.
         position: ``[T, D]``.
         velocity: ``[T, D]``.
         motion: what the source measured.
     """
 
     episode: int
+    names: Sequence[str]
     position: np.ndarray
     velocity: np.ndarray
     motion: Motion
 
 
-def judge_quality(episodes: Sequence[Derived], names: Sequence[str]) -> dict:
+def judge_quality(derived: Sequence[Derived]) -> dict:
     """Measure the quality of derived columns.
 
     Args:
-        episodes: all episodes of the dataset.
-        names: names of the entries.
+        derived: all episodes of the dataset, from every source.
 
     Returns:
         JSON values: ``verdict``, ``good`` or ``doubtful`` (a check fails); ``checks``, a dict by the names of
         :data:`LIMITS` of those that the source allows, each with ``value`` (of the worst object or entry), ``limit``,
         ``good``, ``where`` (that object or entry), ``episode`` (the worst one), ``what`` and ``advice``.
     """
-    rows = [_measure(episode, names) for episode in episodes]
+    rows: dict[int, dict] = {}  # values by check and place, by episode
+    for part in derived:
+        row = rows.setdefault(part.episode, {})
+        for name, values in _measure(part).items():
+            row.setdefault(name, {}).update(values)
     checks = {}
     for name, (limit, more, what, advice) in LIMITS.items():
-        found = [row[name] for row in rows if row.get(name)]
+        found = [row[name] for row in rows.values() if row.get(name)]
         if not found:
             continue
         sign = 1 if more else -1
@@ -103,7 +108,7 @@ def judge_quality(episodes: Sequence[Derived], names: Sequence[str]) -> dict:
             "limit": limit,
             "good": sign * means[where] <= sign * limit,
             "where": where,
-            "episode": episodes[worst].episode,
+            "episode": list(rows)[worst],
             "what": what,
             "advice": advice,
         }
@@ -129,9 +134,9 @@ def quality_text(quality: dict) -> str:
     return "\n".join(lines)
 
 
-def _measure(episode: Derived, names: Sequence[str]) -> dict[str, dict[str, float]]:
+def _measure(episode: Derived) -> dict[str, dict[str, float]]:
     """Return every measure of an episode by object or entry."""
-    position, motion = episode.position, episode.motion
+    names, position, motion = episode.names, episode.position, episode.motion
     lines = [i for i in range(position.shape[1]) if i not in motion.angles]
     extent = np.quantile(position, 0.95, 0) - np.quantile(position, 0.05, 0)
     extent = max(extent[lines].max(initial=0.0), 1e-9)
@@ -154,8 +159,9 @@ def _measure(episode: Derived, names: Sequence[str]) -> dict[str, dict[str, floa
     result["step"] = dict(zip(bodies, np.quantile(step, 0.99, axis=0) / size, strict=True))
     result["background"] = {"picture": tracks.moving}
     if motion.other is not None:
+        size = position.shape[1] // len(bodies)
         result["agreement"] = {
-            body: _correlation(*(v[:, 3 * n : 3 * n + 2] for v in (episode.velocity, motion.other)))
+            body: _correlation(*(v[:, size * n : size * n + 2] for v in (episode.velocity, motion.other)))
             for n, body in enumerate(bodies)
         }
     return result
@@ -165,7 +171,7 @@ def _bodies(names: Sequence[str], count: int) -> list[str]:
     """Return the names of the objects, which begin those of their entries."""
     if count == 1:
         return [names[0].rpartition("_")[0] or "all that moves"]
-    return [names[3 * n].rpartition("_")[0] for n in range(count)]
+    return [name.rpartition("_")[0] for name in names[:: len(names) // count]]
 
 
 def _smooth(position: np.ndarray) -> np.ndarray:

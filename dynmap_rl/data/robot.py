@@ -14,10 +14,10 @@ from tensordict import TensorDict
 
 from dynmap_rl.keys import DYNAMICS
 
-from .derive import entry_names, parse_entries
 from .format.frames import choose_camera, iterate_frames
 from .format.reading import choose_splits, find_dataset, read_column, read_info, read_table, spans
 from .normalization import range_constants
+from .state import entry_names, parse_entries
 
 LONGEST = 120  # steps of a piece; longer pieces make batches of whole pieces slow
 

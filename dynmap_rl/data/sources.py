@@ -1,8 +1,8 @@
-"""Sources of positions for datasets without dynamics: columns of a state, or the frames alone."""
+"""Positions from frames, for datasets without dynamics."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from .flow import flow_velocity
 from .format.frames import choose_camera, iterate_frames
 from .tracking import SORTS, WIDEST, Tracks, track_centroid, track_objects
 
-SOURCES = "state", "centroid", "tracks", "flow"
+SOURCES = "state", "centroid", "tracks", "flow", "state,tracks", "state,flow"
 BODY = "x", "y", "theta"
 
 
@@ -55,8 +55,10 @@ class Camera:
             :func:`dynmap_rl.data.flow.flow_velocity`).
         column: the camera's column.
         objects: number of objects, for ``tracks`` and ``flow``.
-        threshold: smallest difference of a colour channel, 0 to 255, of a pixel that moves.
-        sort: order of the objects.
+        colors: colour of each object (RGB, 0 to 255); None tells them apart by themselves.
+        threshold: smallest difference of a colour channel, 0 to 255, of a pixel that moves, and of two colours.
+        sort: order of the objects, where no colours are given.
+        point: whether the angles of ``tracks`` and ``flow`` are left out.
         width: width of the picture (m). Positions are then in m from its lower left corner, y up, and angles
             counterclockwise. Without it they are pixels of the full frame, y down, and angles clockwise.
     """
@@ -64,16 +66,23 @@ class Camera:
     source: str
     column: str
     objects: int = 1
+    colors: tuple[tuple[int, int, int], ...] | None = None
     threshold: int = 30
     sort: str = "lowest"
+    point: bool = False
     width: float | None = None
+
+    @property
+    def size(self) -> int:
+        """Number of entries of an object."""
+        return 2 if self.point or self.source == "centroid" else 3
 
     @property
     def names(self) -> list[str]:
         """Names of the entries of the position."""
         if self.source == "centroid":
             return ["x", "y"]
-        return [f"object{n}_{name}" for n in range(1, self.objects + 1) for name in BODY]
+        return [f"object{n}_{name}" for n in range(1, self.objects + 1) for name in BODY[: self.size]]
 
 
 def choose_view(
@@ -84,8 +93,10 @@ def choose_view(
     *,
     camera: str | None = None,
     objects: int | None = None,
+    colors: Sequence[str] | None = None,
     threshold: int = 30,
     sort: str = "lowest",
+    point: bool = False,
     width: float | None = None,
 ) -> Camera:
     """Return how frames are read.
@@ -97,15 +108,23 @@ def choose_view(
         planar: whether the dataset is a recording of cart and block, whose picture is 1 m wide and shows two objects.
         camera: the camera's column; by default the first one.
         objects: see :class:`Camera`, also for the next; by default two for a planar recording, otherwise one.
+        colors: colour of each object, a name or ``#rrggbb``, in the place of ``objects`` and ``sort``.
         threshold: smallest difference of a pixel that moves.
         sort: order of the objects.
+        point: leave the angles out.
         width: width of the picture (m); by default 1 for a planar recording, otherwise None.
 
     Raises:
         ValueError: an argument is wrong.
     """
-    if objects is not None and source == "centroid":
-        raise ValueError("--objects has no effect with --source centroid; leave it out")
+    if source == "centroid" and (objects is not None or colors or point):
+        raise ValueError(
+            "--objects, --colors and --point have no effect with --source centroid; leave them out"
+        )
+    if colors and (objects is not None or sort != "lowest"):
+        raise ValueError("--objects and --sort have no effect with --colors; leave them out")
+    colors = tuple(map(_parse_color, colors)) if colors else None
+    objects = len(colors) if colors else objects
     if objects is None:
         objects = len(BODIES) // 3 if planar and source != "centroid" else 1
     if objects < 1 or not 0 < threshold < 256:
@@ -117,7 +136,17 @@ def choose_view(
     width = 1.0 if width is None and planar else width
     if width is not None and width <= 0:
         raise ValueError(f"--width must be above 0, got {width}")
-    return Camera(source, choose_camera(root, info, camera), objects, threshold, sort, width)
+    column = choose_camera(root, info, camera)
+    return Camera(source, column, objects, colors, threshold, sort, point, width)
+
+
+def _parse_color(text: str) -> tuple[int, int, int]:
+    from PIL import ImageColor
+
+    try:
+        return ImageColor.getrgb(text.strip())[:3]
+    except ValueError as error:
+        raise ValueError(f"--colors must be colours such as #1c1c1c,red, got {text!r}") from error
 
 
 def read_motion(root: Path, info: dict, camera: Camera) -> Iterator[tuple[int, Motion]]:
@@ -156,14 +185,20 @@ def measure(frames: np.ndarray, factor: float, camera: Camera, fps: float) -> Mo
         centroid, found = track_centroid(frames, camera.threshold)
         place, scale = _scale(height, width, factor, camera.width, 2)
         return Motion(place(centroid), [], found=found[:, None])
-    tracks = track_objects(frames, camera.objects, camera.threshold, camera.sort)
-    place, scale = _scale(height, width, factor, camera.width, 3)
+    tracks = track(frames, camera)
+    size = camera.size
+    place, scale = _scale(height, width, factor, camera.width, size)
     count = len(frames)
-    position = place(tracks.pose).reshape(count, -1)
-    flow = (flow_velocity(frames, tracks) * scale * fps).reshape(count, -1)
-    angles = list(range(2, position.shape[1], 3))
+    position = place(tracks.pose[..., :size]).reshape(count, -1)
+    flow = (flow_velocity(frames, tracks)[..., :size] * scale * fps).reshape(count, -1)
+    angles = [] if camera.point else list(range(2, position.shape[1], 3))
     used = {"velocity" if camera.source == "flow" else "other": flow}
     return Motion(position, angles, found=tracks.found, tracks=tracks, **used)
+
+
+def track(frames: np.ndarray, camera: Camera) -> Tracks:
+    """Track the objects of a camera in frames uint8 ``[T, height, width, 3]``."""
+    return track_objects(frames, camera.objects, camera.threshold, camera.sort, camera.colors)
 
 
 def _scale(height: int, width: int, factor: float, metres: float | None, size: int):

@@ -6,6 +6,7 @@ median of the episode. Depth is not measured.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -77,7 +78,13 @@ def track_centroid(frames: np.ndarray, threshold: int = 30) -> tuple[np.ndarray,
     return fill_gaps(centroids, found), found
 
 
-def track_objects(frames: np.ndarray, objects: int = 1, threshold: int = 30, sort: str = "lowest") -> Tracks:
+def track_objects(
+    frames: np.ndarray,
+    objects: int = 1,
+    threshold: int = 30,
+    sort: str = "lowest",
+    colors: Sequence[tuple[int, int, int]] | None = None,
+) -> Tracks:
     """Segment what moves into objects, and measure centre and angle of each in every frame.
 
     A pixel belongs to what moves if its colour is more frequent among pixels that differ from the background than
@@ -86,7 +93,9 @@ def track_objects(frames: np.ndarray, objects: int = 1, threshold: int = 30, sor
     than ``threshold`` are one). Colours that are seen in less than a tenth of the frames, or that move less, are left
     out. The object is the largest connected region of its colour; centre and angle are its moments.
 
-    An object of several colours needs ``objects`` = 1, and objects of one colour are not told apart. The angle is
+    An object of several colours needs ``objects`` = 1, and objects of one colour are not told apart. With ``colors``,
+    a pixel belongs to the object whose colour is nearest, if no channel differs by ``threshold`` or more, and regions in
+    which nothing ever moves are left out. Other things may then move too, such as an arm. The angle is
     that of the longest axis, or of the shortest one if that is nearer to the horizontal in the first frame. It means
     little for an object as wide as tall.
 
@@ -96,6 +105,7 @@ def track_objects(frames: np.ndarray, objects: int = 1, threshold: int = 30, sor
         threshold: smallest difference of a colour channel, 0 to 255, of a pixel that moves.
         sort: order of the objects: ``lowest`` in the picture first, at the first frame; ``largest`` or ``brightest``
             first. The order must be the same in all episodes.
+        colors: colour of each object (RGB, 0 to 255), in the place of ``objects`` and ``sort``.
 
     Raises:
         ValueError: fewer objects move, or no pixel is at rest. The message is the end of a sentence.
@@ -107,18 +117,23 @@ def track_objects(frames: np.ndarray, objects: int = 1, threshold: int = 30, sor
         raise ValueError(_still(threshold))
     if ever.all():
         raise ValueError("every pixel changes; the camera must stand still, and the light must not change")
-    labels = _split(frames, _moving(frames, changed, ever), objects, threshold)
+    if colors is None:
+        labels = _split(frames, _moving(frames, changed, ever), objects, threshold)
+    else:
+        labels, objects = _find_colors(frames, ever, colors, threshold), len(colors)
     regions = [[_measure(frame_labels == n) for n in range(1, objects + 1)] for frame_labels in labels]
     area = np.array([[region[1] for region in row] for row in regions], float)
     found = area >= np.array([_faintest(column) for column in area.T])
     if not found.any(0).all():
-        raise ValueError(f"must have {objects} objects that move, got fewer; use fewer --objects")
+        raise ValueError(
+            f"must have {objects} objects that move, got fewer; use fewer --objects or other --colors"
+        )
     pose = np.array([[region[0] for region in row] for row in regions])
     cut = np.array([[region[2] for region in row] for row in regions]) & found
     for n in range(objects):
         pose[:, n, 2] = _straighten(pose[:, n, 2], found[:, n])
         pose[:, n] = fill_gaps(pose[:, n], found[:, n])
-    order = _order(sort, pose, area, found, frames, labels)
+    order = range(objects) if colors else _order(sort, pose, area, found, frames, labels)
     numbers = np.zeros(objects + 1, np.uint8)
     numbers[np.asarray(order) + 1] = np.arange(1, objects + 1)
     return Tracks(
@@ -146,10 +161,26 @@ def _moving(frames: np.ndarray, changed: np.ndarray, ever: np.ndarray) -> np.nda
     likely = moving / moving.sum() > still / still.sum()
     masks = likely[colors]
     for mask in masks:  # what never changes may have the same colour
-        count, regions = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
-        touched = np.bincount(regions[ever], minlength=count) > 0
-        mask &= touched[regions]
+        mask &= _touched(mask, ever)
     return masks
+
+
+def _touched(mask: np.ndarray, ever: np.ndarray) -> np.ndarray:
+    """Return the regions of a mask ``[height, width]`` that contain pixels which ever change."""
+    count, regions = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
+    return (np.bincount(regions[ever & mask], minlength=count) > 0)[regions]
+
+
+def _find_colors(frames: np.ndarray, ever: np.ndarray, colors, threshold: int) -> np.ndarray:
+    """Return the number of the object of every pixel by given colours, uint8 ``[T, height, width]``; 0 is none."""
+    labels = np.zeros(frames.shape[:3], np.uint8)
+    for t, frame in enumerate(frames):
+        distance = np.stack([cv2.absdiff(frame, np.full_like(frame, color)).max(2) for color in colors])
+        nearest = distance.argmin(0)
+        for n in range(len(colors)):
+            mask = (nearest == n) & (distance[n] < threshold)
+            labels[t][mask & _touched(mask, ever)] = n + 1
+    return labels
 
 
 def _every(frames: np.ndarray, where: np.ndarray) -> np.ndarray:

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dynmap_rl.data.derive import entry_names
 from dynmap_rl.data.format.frames import choose_camera, iterate_frames
 from dynmap_rl.data.format.reading import (
     find_dataset,
@@ -17,6 +16,7 @@ from dynmap_rl.data.format.reading import (
     read_table,
     spans,
 )
+from dynmap_rl.data.state import entry_names
 from dynmap_rl.keys import DYNAMICS
 
 from .html import write_html

@@ -8,8 +8,8 @@ import numpy as np
 
 from dynmap_rl.data.format.frames import iterate_frames
 from dynmap_rl.data.format.reading import find_dataset, read_info
-from dynmap_rl.data.sources import Camera
-from dynmap_rl.data.tracking import WIDEST, track_objects
+from dynmap_rl.data.sources import Camera, track
+from dynmap_rl.data.tracking import WIDEST
 
 from .figures import plt, save_figure
 
@@ -31,7 +31,7 @@ def plot_tracks(dataset: str | Path, view: Camera, episode: int, path: Path) -> 
     frames = next(
         f for e, f, _ in iterate_frames(root, read_info(root), view.column, widest=WIDEST) if e == episode
     )
-    tracks = track_objects(frames, view.objects, view.threshold, view.sort)
+    tracks = track(frames, view)
     shown = np.linspace(0, len(frames) - 1, SHOWN).round().astype(int)
     figure, axes = plt.subplots(2, SHOWN // 2, figsize=(9, 5), layout="constrained")
     for axis, t in zip(axes.flat, shown, strict=True):
@@ -44,7 +44,8 @@ def plot_tracks(dataset: str | Path, view: Camera, episode: int, path: Path) -> 
             length = np.sqrt(max(tracks.area[t, n], 16)) / 2
             axis.plot(x, y, "." if tracks.found[t, n] else "x", color=color, ms=5)
             ends = np.array([-length, length])
-            axis.plot(x + ends * np.cos(angle), y + ends * np.sin(angle), color=color, lw=1)
+            if not view.point:
+                axis.plot(x + ends * np.cos(angle), y + ends * np.sin(angle), color=color, lw=1)
         axis.set_title(f"episode {episode}, frame {t}", fontsize=7)
         axis.set(xticks=[], yticks=[])
     save_figure(figure, path)

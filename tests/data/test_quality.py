@@ -17,7 +17,7 @@ POSES = make_poses(120)
 def judge(frames, objects=2):
     motion = measure(frames, 1.0, Camera("tracks", "front", objects), 20)
     velocity, _ = differentiate(motion.position, np.arange(len(frames)) / 20, "savgol")
-    return judge_quality([Derived(7, motion.position, velocity, motion)], NAMES[: 3 * objects])
+    return judge_quality([Derived(7, NAMES[: 3 * objects], motion.position, velocity, motion)])
 
 
 def hide(frames):
@@ -65,7 +65,7 @@ def test_a_fault_of_a_film_is_found_with_its_place(fault):
 
 def judge_state(position):
     velocity, _ = differentiate(position, np.arange(len(position)) / 20)
-    return judge_quality([Derived(0, position, velocity, Motion(position, [2, 5]))], NAMES)["checks"]
+    return judge_quality([Derived(0, NAMES, position, velocity, Motion(position, [2, 5]))])["checks"]
 
 
 @pytest.mark.parametrize(
@@ -100,7 +100,7 @@ def test_angles_in_degrees_are_judged_like_those_in_radians():
     ]
     degrees = noisy * np.tile([1, 1, 180 / np.pi], 2)
     motions = Motion(noisy, [2, 5]), Motion(degrees, [2, 5], 360)
-    found = [judge_quality([Derived(0, m.position, m.position, m)], NAMES)["checks"] for m in motions]
+    found = [judge_quality([Derived(0, NAMES, m.position, m.position, m)])["checks"] for m in motions]
     assert found[0]["residual_angle"]["value"] == pytest.approx(found[1]["residual_angle"]["value"])
 
 
@@ -120,7 +120,9 @@ def test_the_worst_episode_is_named_and_a_dataset_is_judged(tmp_path):
         if episode == 2:
             position[::5] += 9
         episodes.append(
-            Derived(episode, position, differentiate(position, np.arange(len(position)))[0], motion)
+            Derived(
+                episode, camera.names, position, differentiate(position, np.arange(len(position)))[0], motion
+            )
         )
-    checks = judge_quality(episodes, camera.names)["checks"]
+    checks = judge_quality(episodes)["checks"]
     assert checks["residual"]["episode"] == 2 and checks["lost"]["value"] == 0

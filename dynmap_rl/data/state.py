@@ -1,0 +1,125 @@
+"""Positions in a column of numbers, such as a robot's own state."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .format.reading import read_column, read_table, spans
+from .sources import Motion
+
+
+@dataclass(frozen=True)
+class State:
+    """How a column is turned into positions.
+
+    Attributes:
+        column: the column.
+        columns: its entries that are taken.
+        names: their names.
+        angles: those of the taken entries that are angles, by their place among them.
+        period: period of the angles: 2 pi for radians, 360 for degrees.
+        noise: standard deviation of normal noise that is added to the positions, for experiments, in their unit.
+        angle_noise: likewise of the angles.
+        seed: seed of the noise.
+    """
+
+    column: str
+    columns: list[int]
+    names: list[str]
+    angles: list[int]
+    period: float = 2 * math.pi
+    noise: float = 0.0
+    angle_noise: float = 0.0
+    seed: int = 0
+
+
+def choose_state(
+    info: dict,
+    column: str,
+    columns: Iterable[int] | None = None,
+    angles: Iterable[int] = (),
+    period: float = 2 * math.pi,
+    noise: float = 0.0,
+    angle_noise: float = 0.0,
+    seed: int = 0,
+) -> State:
+    """Return how a column is read.
+
+    Args:
+        info: content of the dataset's ``meta/info.json``.
+        column: the column.
+        columns: entries to take; by default all.
+        angles: entries among ``columns`` that are angles.
+        period: see :class:`State`, also for the next.
+        noise: noise of the positions.
+        angle_noise: noise of the angles.
+        seed: seed of the noise.
+
+    Raises:
+        ValueError: an argument is wrong.
+    """
+    if noise < 0 or angle_noise < 0:
+        raise ValueError(f"--noise and --angle_noise must be at least 0, got {noise} and {angle_noise}")
+    numbers = ("float32", "float64")
+    vectors = [n for n, f in info["features"].items() if f["dtype"] in numbers and len(f["shape"]) == 1]
+    if column not in vectors:
+        raise ValueError(f"--state must be a column of numbers, one of {', '.join(vectors)}, got {column!r}")
+    size = info["features"][column]["shape"][0]
+    columns = list(range(size) if columns is None else columns)
+    if not columns or len(set(columns)) < len(columns) or not all(0 <= i < size for i in columns):
+        raise ValueError(f"--columns must be different entries of {column}, 0 to {size - 1}, got {columns}")
+    if unknown := [i for i in angles if i not in columns]:
+        raise ValueError(f"--angles must be among --columns {columns}, got {unknown}")
+    names, places = entry_names(info, column), [columns.index(i) for i in angles]
+    return State(column, columns, [names[i] for i in columns], places, period, noise, angle_noise, seed)
+
+
+def read_state(root: Path, info: dict, state: State) -> Iterator[tuple[int, Motion]]:
+    """Iterate over the episodes' positions in a column.
+
+    Args:
+        root: folder of the dataset.
+        info: content of its ``meta/info.json``.
+        state: column and its settings.
+
+    Raises:
+        ValueError: a file is damaged.
+    """
+    table = read_table(root, info, [state.column])
+    position = read_column(root, info, table, state.column, np.float64).numpy()[:, state.columns]
+    is_angle = np.isin(np.arange(len(state.columns)), state.angles)
+    scale = np.where(is_angle, state.angle_noise, state.noise)
+    position += scale * np.random.default_rng(state.seed).standard_normal(position.shape)
+    for episode, rows in spans(table["episode_index"].to_numpy()):
+        yield episode, Motion(position[rows], state.angles, state.period)
+
+
+def parse_entries(text: str | None, option: str) -> list[int] | None:
+    """Read a text such as ``0,2`` as numbers; None stays None.
+
+    Args:
+        text: the text.
+        option: name of the option, for the message.
+
+    Raises:
+        ValueError: the text is not a list of whole numbers.
+    """
+    try:
+        return None if text is None else [int(entry) for entry in text.split(",")]
+    except ValueError as error:
+        raise ValueError(f"{option} must be whole numbers such as 0,1,2, got {text!r}") from error
+
+
+def entry_names(info: dict, column: str) -> list[str]:
+    """Return a name for every entry of a column: the dataset's own names, or numbers where it has none."""
+    feature = info["features"][column]
+    size, names = math.prod(feature["shape"]), feature.get("names")
+    if isinstance(names, dict):  # by groups, as in {"motors": [...]}
+        names = [name for group in names.values() if isinstance(group, list) for name in group]
+    named = isinstance(names, list) and len(names) == size
+    return [str(name) for name in names] if named else [str(i) for i in range(size)]
