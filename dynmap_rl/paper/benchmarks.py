@@ -20,8 +20,14 @@ TASKS = "FetchPush", "FetchSlide", "PlateSlide", "Soccer"
 SEEDS = 0, 1, 2  # of weights and batches, of world models and policies
 DERIVED = {  # rows whose dynamics need no simulator: name of their dataset, and how its columns are derived
     "RGB+[P+V] of the hand": ("hand", {"columns": [0, 1, 2]}),  # of its recorded positions
-    "RGB+[P+V], tracked": ("tracks", {"source": "tracks", "objects": 2}),  # of object and hand, in the frames
+    "RGB+[P+V], tracked": (
+        "tracks",
+        {"source": "tracks", "objects": 2},
+    ),  # of two things that move in the frames
+    # of the hand, and of the object by its colour
+    "RGB+[P+V], hand and color": ("color", {"source": "state,tracks", "columns": [0, 1, 2], "point": True}),
 }
+COLORS = {"FetchPush": {"colors": ["#1c1c1c"], "threshold": 24}}  # of the object, where it has one of its own
 METHODS = {  # by the row of the table: recipe and its options
     "Only-RGB": ("decoupled", ("--world_model.supervision", "none")),
     "RGB+[P]": ("decoupled", ("--world_model.supervision", "position")),
@@ -80,6 +86,8 @@ def list_benchmarks(episodes: int = 500) -> dict[tuple[str, str, int], Run]:
     runs = {}
     for task in TASKS:
         for method, (recipe, options) in METHODS.items():
+            if method.endswith("color") and task not in COLORS:
+                continue
             for seed in SEEDS:
                 arguments = ["--task", f"mujoco:{task}", *options, "--seeds", str(seed)]
                 if recipe == "decoupled":
@@ -104,10 +112,11 @@ def derived_dataset(task: str, method: str) -> Path:
     return Path("datasets") / f"{name}_{DERIVED[method][0]}"
 
 
-def derive_dataset(recording: Path, method: str, folder: Path) -> None:
+def derive_dataset(task: str, recording: Path, method: str, folder: Path) -> None:
     """Derive a dataset from a recording if it is missing; ``NAME.quality.json`` beside it has its quality."""
     if not folder.exists():
-        found = add_dynamics(recording, folder, **DERIVED[method][1], replace=True)
+        columns = DERIVED[method][1] | (COLORS[task] if method.endswith("color") else {})
+        found = add_dynamics(recording, folder, **columns, replace=True)
         write_json(quality_file(folder), found["quality"])
 
 

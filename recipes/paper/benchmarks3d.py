@@ -6,8 +6,8 @@
     python recipes/paper/benchmarks3d.py --write                      # the page from the results alone
 
 A cell is a run of another recipe for one task, method and seed, and its result a JSON file; cells with a result are skipped.
-The same command resumes a stopped grid, and every cell. Two rows have dynamics that are derived from the recordings, in
-datasets/TASK_hand and datasets/TASK_tracks. The page has success, failures by cause, and animations. Needs
+The same command resumes a stopped grid, and every cell. Three rows have dynamics that are derived from the recordings, in
+datasets/TASK_hand, _tracks and _color. The page has success, failures by cause, and animations. Needs
 pip install '.[lerobot,mujoco]'.
 """
 
@@ -69,7 +69,8 @@ def main(config: Config) -> None:
     recordings = {task: find_or_record(task) for task in sorted({cell.task for cell in todo})}
     for cell in todo:  # cells must not record or derive at the same time
         if cell.dataset:
-            derive_dataset(recordings[cell.task], cell.cell[-1], Path(cell.dataset))
+            task = cell.task.removeprefix("mujoco:")
+            derive_dataset(task, recordings[cell.task], cell.cell[-1], Path(cell.dataset))
     run = partial(
         execute, recipes=RECIPES, results=config.results, runs=config.runs,
         threads=2 if config.workers == 1 else 1, presets=config.presets, root=Path.cwd(),

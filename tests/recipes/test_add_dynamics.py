@@ -270,7 +270,7 @@ def test_a_killed_run_leaves_nothing_that_looks_done(images, tmp_path):
         ({"camera": "observation.images.top"}, "--camera has no effect with --source state"),
         ({"source": "radar"}, "--source .*'radar'"),
         ({"source": "tracks", "objects": 0}, "--objects"),
-        ({"source": "centroid", "objects": 2}, "--objects has no effect with --source centroid"),
+        ({"source": "centroid", "objects": 2}, "--objects, .* no effect with --source centroid"),
         ({"source": "tracks", "sort": "oldest"}, "--sort .*'oldest'"),
         ({"source": "tracks", "noise": 0.1}, "--noise has no effect"),
         ({"source": "tracks", "width": -1.0}, "--width"),
