@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from films import film, make_poses
+from films import COLORS, film, make_poses
 from robot_dataset import draw
 
 from dynmap_rl.data.flow import flow_velocity
@@ -68,6 +68,24 @@ def test_the_order_of_the_objects_is_the_chosen_one():
     assert np.array_equal(heights["lowest"], heights["brightest"][::-1])
     labels = track_objects(frames, 2, sort="brightest").labels
     assert frames[labels == 1].mean() > frames[labels == 2].mean()
+
+
+@pytest.mark.parametrize("n", [0, 1])
+def test_an_object_is_found_by_its_colour_beside_another_that_moves(n):
+    """Also where something at rest has the colour, and whatever the order of the colours is."""
+    poses = make_poses()
+    frames = film(poses, SIZE, noise=4.0)
+    frames[:, :8, :8] = COLORS[n]
+    tracks = track_objects(frames, colors=[COLORS[n]])
+    assert tracks.found.all() and tracks.pose.shape == (60, 1, 3)
+    assert np.abs(tracks.pose[:, 0] - truth(poses)[:, n])[:, :2].max() < 1.5
+    both = track_objects(frames, colors=[COLORS[n], COLORS[1 - n]])
+    assert np.array_equal(both.pose[:, :1], tracks.pose)
+
+
+def test_a_colour_that_is_not_there_is_refused():
+    with pytest.raises(ValueError, match="--colors"):
+        track_objects(film(make_poses(), SIZE), colors=[COLORS[0], (0, 255, 0)])
 
 
 def test_gaps_are_filled_linearly_and_at_the_ends_with_the_nearest_value():
