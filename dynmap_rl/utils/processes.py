@@ -159,6 +159,7 @@ def run_script(script: Path, arguments: list[str], folder: Path, log: Path) -> i
 
 
 def _run_here(script: str, arguments: list[str], folder: Path, log: Path) -> None:
+    os.environ.setdefault("TQDM_MININTERVAL", "30")  # s; every update of a bar would be a line of the file
     start_worker()
     with open(log, "a") as file:
         for stream in (sys.stdout, sys.stderr):
