@@ -19,6 +19,7 @@ POLICIES = "recurrent", "feedforward"
 WORLD_MODELS = 0, 1, 2  # seeds
 SIZES = 30, 100, 300, 1000  # demonstrations
 SUPERVISION = "position,velocity"
+COMMAND = {"columns": [0, 1, 2], "angles": [2]}  # entries of the state: what the robot knows of itself
 TURN = 5  # rad of noise on an angle for a metre of noise on a position
 
 
@@ -59,7 +60,8 @@ SOURCES = {
         )
         for share in (5, 10, 25, 50)
     },
-    "command": Source("commanded cart pose", {"columns": [0, 1, 2], "angles": [2]}),
+    "command": Source("commanded cart pose", COMMAND),
+    "command_tracks": Source("commanded cart pose, and tracks", COMMAND | {"source": "state,tracks"}),
     "informed": Source("simulator, no RGB loss", None, ("--world_model.beta_rgb", "0")),
 }
 DATA_ROWS = {
