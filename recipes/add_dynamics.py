@@ -88,7 +88,7 @@ def main(config: Config) -> None:
     settings = vars(config) | {
         "columns": parse_entries(config.columns, "--columns"),
         "angles": parse_entries(config.angles, "--angles") or [],
-        "colors": config.colors.split(",") if config.colors else None,
+        "colors": config.colors.split(",") if config.colors is not None else None,
     }
     found = add_dynamics(**settings)
     print(f"written: {config.output}")

@@ -9,6 +9,7 @@ import argparse
 import dataclasses
 import difflib
 import errno
+import json
 import os
 import re
 import shlex
@@ -113,23 +114,33 @@ def list_options(config_class: type, prefix: str = "--") -> dict[str, type]:
 def read_arguments(given: Sequence[str], config_class: type) -> list[str]:
     """Normalise arguments: ``--dry-run`` becomes ``--dry_run``, and a bare flag is followed by ``true``.
 
+    Values are YAML. Those of texts and paths are quoted, as YAML would read ``#1c1c1c`` as a comment, ``yes`` as true and
+    ``2026-01-01`` as a date; ``null`` stays None.
+
     Raises:
         ValueError: an option is unknown.
     """
-    options = list_options(config_class)
-    arguments = []
+    options, arguments, text = list_options(config_class), [], False
     for i, argument in enumerate(given):
         name, equals, value = argument.partition("=")
-        if name.startswith("--"):
-            name = f"--{name[2:].replace('-', '_')}"
-            if name not in {*options, "--help", "--config_path"}:
-                raise ValueError(f"unknown option {name}; {_suggest(name, options)}")
-            argument = name + equals + value
-        arguments.append(argument)
-        flag = options.get(argument) is bool
-        if flag and "".join(given[i + 1 : i + 2]).lower() not in ("true", "false"):
+        if not name.startswith("--"):
+            arguments.append(_quote(argument) if text else argument)
+            text = False
+            continue
+        name = f"--{name[2:].replace('-', '_')}"
+        if name not in {*options, "--help", "--config_path"}:
+            raise ValueError(f"unknown option {name}; {_suggest(name, options)}")
+        kind = options.get(name)
+        text = {*typing.get_args(kind), kind} & {str, Path} != set()
+        arguments.append(f"{name}={_quote(value) if text else value}" if equals else name)
+        text = text and not equals
+        if kind is bool and not equals and "".join(given[i + 1 : i + 2]).lower() not in ("true", "false"):
             arguments.append("true")
     return arguments
+
+
+def _quote(value: str) -> str:
+    return value if value == "null" else json.dumps(value, ensure_ascii=False)
 
 
 def _suggest(name: str, options: dict[str, type]) -> str:

@@ -253,19 +253,20 @@ def test_a_killed_run_leaves_nothing_that_looks_done(images, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["output"]
 
 
-def test_state_and_tracks_stand_side_by_side_and_are_judged_together(folder_of_runs, videos, tmp_path):
+def test_state_and_tracks_stand_side_by_side_and_are_judged_together(videos, tmp_path):
     output = tmp_path / "both"
-    settings = {"source": "state,tracks", "columns": "0,1", "colors": "#c81e1e", "point": True}
-    main(Config(dataset=str(videos[0]), output=output, **settings))
+    options = "--source", "state,tracks", "--columns", "0,1", "--colors", "#c81e1e", "--point"
+    done = run(tmp_path, "add_dynamics", "--dataset", videos[0], "--output", output, *options)
+    assert done.returncode == 0, done.stderr
     features = json.loads((output / "meta/info.json").read_text())["features"]
     assert features["dynamics.velocity"]["names"] == ["x", "y", "object1_x", "object1_y"]
     position, velocity = read(output, "dynamics.position"), read(output, "dynamics.velocity")
     pixels = np.array([128, 96])
     assert np.abs(position[:, 2:] - pixels * position[:, :2]).max() < 2
     assert np.corrcoef(velocity[:, 2], velocity[:, 0])[0, 1] > 0.95  # squares are drawn at whole pixels
-    checks = json.loads((folder_of_runs / "both/quality.json").read_text())["checks"]
+    checks = json.loads((tmp_path / "runs/add_dynamics/both/quality.json").read_text())["checks"]
     assert {"lost", "residual", "agreement"} < set(checks) and "residual_angle" not in checks
-    assert (folder_of_runs / "both/tracks.png").exists()
+    assert (tmp_path / "runs/add_dynamics/both/tracks.png").exists()
 
 
 @pytest.mark.parametrize(
@@ -286,6 +287,7 @@ def test_state_and_tracks_stand_side_by_side_and_are_judged_together(folder_of_r
         ({"source": "radar"}, "--source .*'radar'"),
         ({"source": "tracks", "objects": 0}, "--objects"),
         ({"source": "centroid", "objects": 2}, "--objects, .* no effect with --source centroid"),
+        ({"source": "tracks", "colors": ""}, "--colors"),
         ({"source": "tracks", "colors": "redd"}, "--colors .*'redd'"),
         ({"source": "tracks", "colors": "lime"}, "--colors"),
         ({"source": "tracks", "colors": "red", "objects": 1}, "--objects .* no effect with --colors"),

@@ -28,6 +28,7 @@ class Settings:
     steps: int = 3
     dry_run: bool = False
     output: Path | None = None
+    color: str = "red"
     first: Group = Group()
     second: Group = Group(rate=0.5)
 
@@ -48,6 +49,19 @@ def run(monkeypatch):
 @pytest.mark.parametrize("arguments", [["--dry-run"], ["--dry_run", "True"], ["--dry-run=true"]])
 def test_options_with_hyphens_and_bare_flags(run, arguments):
     assert run(*arguments, "--steps=-4") == Settings(steps=-4, dry_run=True)
+
+
+@pytest.mark.parametrize(
+    "text", ["#1c1c1c", "2026-01-01", "yes", "0x1f", "a: b", "[1]", "~", 'it\'s "Ä"', "-1", ""]
+)
+def test_texts_and_paths_are_taken_as_they_are(run, text):
+    assert run("--color", text, "--output", text) == Settings(color=text, output=Path(text))
+    assert run(f"--color={text}", f"--output={text}") == Settings(color=text, output=Path(text))
+
+
+def test_null_clears_an_option(run, tmp_path):
+    (tmp_path / "file.yaml").write_text("output: here\n")
+    assert run("--config_path", str(tmp_path / "file.yaml"), "--output", "null") == Settings()
 
 
 def test_a_nested_option_leaves_the_other_defaults_of_its_group(run):
