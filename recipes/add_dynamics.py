@@ -55,7 +55,7 @@ class Config:
     camera: str | None = None
     # Number of objects, for tracks and flow; by default two for a recording of cart and block, otherwise one.
     objects: int | None = None
-    # Colours of the objects, names or #rrggbb, in the place of objects and sort: #1c1c1c,red.
+    # Colours of the objects, names or #rrggbb, instead of objects and sort: #1c1c1c,red.
     colors: str | None = None
     # Difference of a colour channel, 0 to 255, from which on a pixel counts as moving, and colours as different.
     threshold: int = 30
@@ -71,7 +71,9 @@ class Config:
 
 def main(config: Config) -> None:
     """Derive the columns and report."""
+    from dynmap_rl.data.demonstrations import find_meta
     from dynmap_rl.data.derive import add_dynamics
+    from dynmap_rl.data.format.reading import find_dataset
     from dynmap_rl.data.quality import quality_text, worst_episode
     from dynmap_rl.data.state import parse_entries
     from dynmap_rl.reporting.dataset_page import write_dataset_page
@@ -81,9 +83,10 @@ def main(config: Config) -> None:
 
     if not config.dataset or not config.output:
         raise ValueError("--dataset and --output must be given: the dataset, and the folder of the new one")
-    of_state = "state", "columns", "angles", "period", "noise", "angle_noise"
+    of_state = "state", "columns", "angles", "period", "noise", "angle_noise", "noise_seed"
     of_frames = "camera", "objects", "colors", "threshold", "sort", "point", "width"
-    unused = {"state": of_frames, "centroid": of_state, "tracks": of_state, "flow": of_state}
+    unused = {"state": of_frames, "tracks": of_state, "flow": of_state}
+    unused["centroid"] = *of_state, "objects", "colors", "sort", "point"
     refuse(config, Config(), unused.get(config.source, ()), f"--source {config.source}")
     settings = vars(config) | {
         "columns": parse_entries(config.columns, "--columns"),
@@ -92,6 +95,10 @@ def main(config: Config) -> None:
     }
     found = add_dynamics(**settings)
     print(f"written: {config.output}")
+    if find_meta(find_dataset(config.dataset)) and not find_meta(config.output):
+        print(
+            "its dynamics are not those of its task: train with recipes/robot.py, not with recipes/decoupled.py"
+        )
     lines = []
     for quantity, difference in found["differences"].items():
         entries = ", ".join(f"{value:.3g}" for value in difference)

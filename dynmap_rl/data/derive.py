@@ -18,7 +18,7 @@ from .format.columns import write_columns
 from .format.reading import find_dataset, read_column, read_info, read_table, spans
 from .normalization import planar_range, value_range
 from .quality import Derived, judge_quality
-from .sources import SOURCES, Motion, choose_view, read_motion
+from .sources import SOURCES, Camera, Motion, choose_view, read_motion
 from .state import choose_state, read_state
 
 METHODS = ("central", "savgol")
@@ -118,7 +118,7 @@ def add_dynamics(
         camera: column of the frames; by default the first camera.
         objects: number of objects in the frames, for ``tracks`` and ``flow``; by default the number of bodies of a task
             in the plane, otherwise one.
-        colors: colour of each object, such as ``"#1c1c1c"`` or ``"red"``, in the place of ``objects`` and ``sort``.
+        colors: colour of each object, such as ``"#1c1c1c"`` or ``"red"``, instead of ``objects`` and ``sort``.
         threshold: smallest difference of a colour channel of a pixel that moves, and of two colours.
         sort: order of the objects (see :func:`dynmap_rl.data.tracking.track_objects`).
         point: leave the angles of tracked objects out.
@@ -140,8 +140,8 @@ def add_dynamics(
         raise ValueError(f"{root} must not have {', '.join(old)}; replace them with --replace")
     _check_output(root, output)
     if source not in SOURCES:
-        raise ValueError(f"--source must be one of {' '.join(SOURCES)}, got {source!r}")
-    _check_method(method, window, order)
+        raise ValueError(f"--source must be one of {', '.join(map(repr, SOURCES))}, got {source!r}")
+    _check_method(method or ("central" if source == "state" else "savgol"), window, order)
     planar = meta is not None and _is_planar(meta["task"])
     parts, view = [], None  # names, motions by episode, and method
     if "state" in source:
@@ -153,9 +153,13 @@ def add_dynamics(
         view = choose_view(root, info, source.removeprefix("state,"), planar, **frames)
         parts.append((view.names, read_motion(root, info, view), method or "savgol"))
     names = [name for part in parts for name in part[0]]
-    if planar and source in ("tracks", "flow") and len(names) == len(BODIES):
+    if planar and view and view.names == Camera("tracks", "", len(BODIES) // 3).names == names:
         names = list(BODIES)
         parts = [(names, *parts[0][1:])]
+    if len(set(names)) < len(names):
+        raise ValueError(
+            f"names of the dynamics must be different, got {', '.join(names)}; take other --columns"
+        )
     table = read_table(root, info, ["timestamp", *old])
     time = read_column(root, info, table, "timestamp", np.float64).numpy()[:, 0]
     rows = dict(spans(table["episode_index"].to_numpy()))
@@ -228,10 +232,10 @@ def _check_output(root: Path, output: Path) -> None:
         raise ValueError(f"--output must be outside of the dataset, got {output}; choose another")
 
 
-def _check_method(method: str | None, window: int, order: int) -> None:
-    if method not in (None, *METHODS):
+def _check_method(method: str, window: int, order: int) -> None:
+    if method not in METHODS:
         raise ValueError(f"--method must be one of {', '.join(METHODS)}, got {method!r}")
-    if method != "central" and not (window % 2 and 2 <= order < window):
+    if method == "savgol" and not (window % 2 and 2 <= order < window):
         raise ValueError(
             f"--window must be odd and --order at least 2 and below --window, got {window} and {order}"
         )

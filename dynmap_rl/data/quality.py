@@ -159,9 +159,11 @@ def _measure(episode: Derived) -> dict[str, dict[str, float]]:
     result["step"] = dict(zip(bodies, np.quantile(step, 0.99, axis=0) / size, strict=True))
     result["background"] = {"picture": tracks.moving}
     if motion.other is not None:
-        size = position.shape[1] // len(bodies)
+        entries = position.shape[1] // len(bodies)
         result["agreement"] = {
-            body: _correlation(*(v[:, size * n : size * n + 2] for v in (episode.velocity, motion.other)))
+            body: _correlation(
+                *(v[:, entries * n : entries * n + 2] for v in (episode.velocity, motion.other))
+            )
             for n, body in enumerate(bodies)
         }
     return result

@@ -108,7 +108,7 @@ def choose_view(
         planar: whether the dataset is a recording of cart and block, whose picture is 1 m wide and shows two objects.
         camera: the camera's column; by default the first one.
         objects: see :class:`Camera`, also for the next; by default two for a planar recording, otherwise one.
-        colors: colour of each object, a name or ``#rrggbb``, in the place of ``objects`` and ``sort``.
+        colors: colour of each object, a name or ``#rrggbb``, instead of ``objects`` and ``sort``.
         threshold: smallest difference of a pixel that moves.
         sort: order of the objects.
         point: leave the angles out.
@@ -117,20 +117,21 @@ def choose_view(
     Raises:
         ValueError: an argument is wrong.
     """
-    if source == "centroid" and (objects is not None or colors or point):
-        raise ValueError(
-            "--objects, --colors and --point have no effect with --source centroid; leave them out"
-        )
-    if colors and (objects is not None or sort != "lowest"):
-        raise ValueError("--objects and --sort have no effect with --colors; leave them out")
-    colors = tuple(map(_parse_color, colors)) if colors else None
+    if source == "centroid" and (objects is not None or colors is not None or point):
+        raise ValueError("objects, colors and point have no effect with the source centroid; leave them out")
+    if colors is not None:
+        if objects is not None or sort != "lowest":
+            raise ValueError("--objects and --sort have no effect with --colors; leave them out")
+        colors = tuple(map(_parse_color, colors))
+        if not colors or len(set(colors)) < len(colors):
+            raise ValueError("--colors must be a different colour for each object")
     objects = len(colors) if colors else objects
     if objects is None:
         objects = len(BODIES) // 3 if planar and source != "centroid" else 1
-    if objects < 1 or not 0 < threshold < 256:
-        raise ValueError(
-            f"--objects must be at least 1 and --threshold 1 to 255, got {objects} and {threshold}"
-        )
+    if objects < 1:
+        raise ValueError(f"--objects must be at least 1, got {objects}")
+    if not 0 < threshold < 256:
+        raise ValueError(f"--threshold must be 1 to 255, got {threshold}")
     if sort not in SORTS:
         raise ValueError(f"--sort must be one of {', '.join(SORTS)}, got {sort!r}")
     width = 1.0 if width is None and planar else width
@@ -144,9 +145,10 @@ def _parse_color(text: str) -> tuple[int, int, int]:
     from PIL import ImageColor
 
     try:
-        return ImageColor.getrgb(text.strip())[:3]
+        red, green, blue = ImageColor.getrgb(text.strip())
     except ValueError as error:
-        raise ValueError(f"--colors must be colours such as #1c1c1c,red, got {text!r}") from error
+        raise ValueError(f"--colors must be names or #rrggbb, such as #1c1c1c,red, got {text!r}") from error
+    return red, green, blue
 
 
 def read_motion(root: Path, info: dict, camera: Camera) -> Iterator[tuple[int, Motion]]:

@@ -21,7 +21,7 @@ class State:
         column: the column.
         columns: its entries that are taken.
         names: their names.
-        angles: those of the taken entries that are angles, by their place among them.
+        angles: indices into ``columns`` of the entries that are angles.
         period: period of the angles: 2 pi for radians, 360 for degrees.
         noise: standard deviation of normal noise that is added to the positions, for experiments, in their unit.
         angle_noise: likewise of the angles.
@@ -48,14 +48,14 @@ def choose_state(
     angle_noise: float = 0.0,
     seed: int = 0,
 ) -> State:
-    """Return how a column is read.
+    """Check the options of a state and return them as a :class:`State`.
 
     Args:
         info: content of the dataset's ``meta/info.json``.
         column: the column.
         columns: entries to take; by default all.
         angles: entries among ``columns`` that are angles.
-        period: see :class:`State`, also for the next.
+        period: period of the angles: 2 pi for radians, 360 for degrees.
         noise: noise of the positions.
         angle_noise: noise of the angles.
         seed: seed of the noise.

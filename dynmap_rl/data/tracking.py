@@ -93,11 +93,14 @@ def track_objects(
     than ``threshold`` are one). Colours that are seen in less than a tenth of the frames, or that move less, are left
     out. The object is the largest connected region of its colour; centre and angle are its moments.
 
-    An object of several colours needs ``objects`` = 1, and objects of one colour are not told apart. With ``colors``,
-    a pixel belongs to the object whose colour is nearest, if no channel differs by ``threshold`` or more, and regions in
-    which nothing ever moves are left out. Other things may then move too, such as an arm. The angle is
-    that of the longest axis, or of the shortest one if that is nearer to the horizontal in the first frame. It means
-    little for an object as wide as tall.
+    An object of several colours needs ``objects`` = 1, and objects of one colour are not told apart.
+
+    With ``colors``, a pixel belongs to the object whose colour is nearest, if no channel differs by ``threshold`` or more.
+    Regions in which nothing moves in the episode are left out, unless the object has no other. Other things may move too,
+    such as an arm.
+
+    The angle is that of the longest axis, or of the shortest one if that is nearer to the horizontal in the first frame. It
+    means little for an object as wide as tall.
 
     Args:
         frames: frames of one episode, uint8 ``[T, height, width, 3]``.
@@ -105,10 +108,11 @@ def track_objects(
         threshold: smallest difference of a colour channel, 0 to 255, of a pixel that moves.
         sort: order of the objects: ``lowest`` in the picture first, at the first frame; ``largest`` or ``brightest``
             first. The order must be the same in all episodes.
-        colors: colour of each object (RGB, 0 to 255), in the place of ``objects`` and ``sort``.
+        colors: colour of each object (RGB, 0 to 255), instead of ``objects`` and ``sort``.
 
     Raises:
-        ValueError: fewer objects move, or no pixel is at rest. The message is the end of a sentence.
+        ValueError: fewer objects move, a colour is not seen, or no pixel is at rest. The message is the end of a
+            sentence.
     """
     background = _background(frames, threshold)
     changed = np.stack([_changed(frame, background, threshold) > 0 for frame in frames])
@@ -116,7 +120,9 @@ def track_objects(
     if not ever.any():
         raise ValueError(_still(threshold))
     if ever.all():
-        raise ValueError("every pixel changes; the camera must stand still, and the light must not change")
+        raise ValueError(
+            "every pixel changes; the camera must stand still and the light must not change, or raise --threshold"
+        )
     if colors is None:
         labels = _split(frames, _moving(frames, changed, ever), objects, threshold)
     else:
@@ -124,9 +130,13 @@ def track_objects(
     regions = [[_measure(frame_labels == n) for n in range(1, objects + 1)] for frame_labels in labels]
     area = np.array([[region[1] for region in row] for row in regions], float)
     found = area >= np.array([_faintest(column) for column in area.T])
-    if not found.any(0).all():
+    if missing := np.flatnonzero(~found.any(0)).tolist():
+        if colors is None:
+            raise ValueError(f"must have {objects} objects that move, got fewer; use fewer --objects")
+        color = "#{:02x}{:02x}{:02x}".format(*colors[missing[0]])
         raise ValueError(
-            f"must have {objects} objects that move, got fewer; use fewer --objects or other --colors"
+            f"must show an object of the colour {color}; read its colour off a frame, or raise --threshold, "
+            f"got {threshold}"
         )
     pose = np.array([[region[0] for region in row] for row in regions])
     cut = np.array([[region[2] for region in row] for row in regions]) & found
@@ -171,16 +181,22 @@ def _touched(mask: np.ndarray, ever: np.ndarray) -> np.ndarray:
     return (np.bincount(regions[ever & mask], minlength=count) > 0)[regions]
 
 
-def _find_colors(frames: np.ndarray, ever: np.ndarray, colors, threshold: int) -> np.ndarray:
+def _find_colors(
+    frames: np.ndarray, ever: np.ndarray, colors: Sequence[tuple[int, int, int]], threshold: int
+) -> np.ndarray:
     """Return the number of the object of every pixel by given colours, uint8 ``[T, height, width]``; 0 is none."""
-    labels = np.zeros(frames.shape[:3], np.uint8)
+    seen, moving = np.zeros((2, *frames.shape[:3]), np.uint8)
     for t, frame in enumerate(frames):
         distance = np.stack([cv2.absdiff(frame, np.full_like(frame, color)).max(2) for color in colors])
         nearest = distance.argmin(0)
         for n in range(len(colors)):
             mask = (nearest == n) & (distance[n] < threshold)
-            labels[t][mask & _touched(mask, ever)] = n + 1
-    return labels
+            seen[t][mask] = n + 1
+            moving[t][mask & _touched(mask, ever)] = n + 1
+    for n in range(1, len(colors) + 1):
+        if not (moving == n).any():  # the object rests in the whole episode
+            moving[seen == n] = n
+    return moving
 
 
 def _every(frames: np.ndarray, where: np.ndarray) -> np.ndarray:

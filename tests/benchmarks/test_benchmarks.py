@@ -13,7 +13,7 @@ import torch
 from own_task import check_renderer
 from stress import kills
 
-from dynmap_rl.data import load_dataset, load_meta, sample_windows
+from dynmap_rl.data import load_dataset, load_meta, record_dataset, sample_windows
 from dynmap_rl.keys import DYNAMICS
 from dynmap_rl.modules.checkpoints import make_world_model
 from dynmap_rl.objectives.world_model import WorldModelLoss
@@ -183,6 +183,19 @@ def test_errors_of_derived_dynamics_grow_with_noise(load, recording, tmp_path, m
     errors = [found["state"][f"savgol, {noise} mm"]["velocity"]["linear"] for noise in (0, 2, 5, 10)]
     assert errors == sorted(errors) and found["state"]["central, 0 mm"]["position"]["linear"] == 0
     assert found["frames"]["tracks, savgol"]["position"]["linear"] < 15 and found["episodes"] == 2
+
+
+@pytest.mark.slow
+def test_tracks_are_nearer_to_the_box_with_its_colour(load, tmp_path, monkeypatch):
+    check_renderer()
+    pytest.importorskip("gymnasium_robotics")
+    record_dataset(tmp_path / "few", "mujoco:FetchPush", episodes=2, eval_episodes=1, workers=1)
+    arguments = ["--recording", str(tmp_path / "few"), "--output", str(tmp_path / "found.json")]
+    monkeypatch.setattr("sys.argv", ["x.py", *arguments])
+    load("tracks3d").main()
+    found = read_json(tmp_path / "found.json")["median_distance_mm"]
+    assert found["RGB+[P+V], hand and color"]["object1"]["object"] < 20
+    assert len(found["RGB+[P+V], tracked"]) == 2
 
 
 @pytest.mark.slow

@@ -1,11 +1,11 @@
 """How near tracks in the frames of a MuJoCo task are to its bodies, which the recording knows.
 
     uv run --extra mujoco python tests/benchmarks/tracks3d.py
-    uv run --extra mujoco python tests/benchmarks/tracks3d.py --only color --output found.json
+    uv run --extra mujoco python tests/benchmarks/tracks3d.py --recording datasets/few --output found.json
 
 The frames measure pixels, and the table is seen at an angle: x and y of a body are fitted by a polynomial of second order of
 the pixels, over all training steps; what remains is the distance. Derives ``datasets/fetch_push_tracks`` and
-``datasets/fetch_push_color`` where they are missing, from ``datasets/fetch_push`` (``python recipes/collect.py --task
+``datasets/fetch_push_color`` beside the recording where they are missing, from ``datasets/fetch_push`` (``python recipes/collect.py --task
 mujoco:FetchPush``). Writes ``recipes/results/measurements/tracks3d.json``.
 """
 
@@ -24,7 +24,7 @@ from dynmap_rl.utils.files import write_json
 from dynmap_rl.utils.version import find_commit
 
 RESULTS = Path(__file__).parents[2] / "recipes/results/measurements" / "tracks3d.json"
-BODIES = {"object": slice(0, 2), "hand": slice(-3, -1)}  # x and y among the recorded positions
+TRUTH = {"object": slice(0, 2), "hand": slice(-3, -1)}  # x and y among the recorded positions
 
 
 def distance(pixels: torch.Tensor, body: torch.Tensor) -> float:
@@ -46,7 +46,7 @@ def compare(tracks: Path, recording: Path) -> dict[str, dict[str, float]]:
         if name.startswith("object") and name.endswith("_x"):
             pixels = found[..., i : i + 2].flatten(0, 1)
             result[name.removesuffix("_x")] = {
-                body: distance(pixels, truth[..., entries].flatten(0, 1)) for body, entries in BODIES.items()
+                body: distance(pixels, truth[..., entries].flatten(0, 1)) for body, entries in TRUTH.items()
             }
     return result
 
@@ -55,10 +55,9 @@ def main() -> None:
     """Derive, compare and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--recording", type=Path, default=Path("datasets/fetch_push"))
-    parser.add_argument("--only", default="", help="a part of the name of a derived dataset")
     parser.add_argument("--output", type=Path, default=RESULTS)
     options = parser.parse_args()
-    rows = {row: name for row, (name, _) in DERIVED.items() if name != "hand" and options.only in name}
+    rows = {row: name for row, (name, _) in DERIVED.items() if name != "hand"}
     distances = {}
     for row, name in rows.items():
         folder = options.recording.with_name(f"{options.recording.name}_{name}")

@@ -75,7 +75,7 @@ def test_an_object_is_found_by_its_colour_beside_another_that_moves(n):
     """Also where something at rest has the colour, and whatever the order of the colours is."""
     poses = make_poses()
     frames = film(poses, SIZE, noise=4.0)
-    frames[:, :8, :8] = COLORS[n]
+    frames[:, :16, :16] = COLORS[n]
     tracks = track_objects(frames, colors=[COLORS[n]])
     assert tracks.found.all() and tracks.pose.shape == (60, 1, 3)
     assert np.abs(tracks.pose[:, 0] - truth(poses)[:, n])[:, :2].max() < 1.5
@@ -83,8 +83,16 @@ def test_an_object_is_found_by_its_colour_beside_another_that_moves(n):
     assert np.array_equal(both.pose[:, :1], tracks.pose)
 
 
+def test_an_object_of_a_given_colour_that_rests_is_found():
+    poses = make_poses()
+    poses[:, 1] = poses[0, 1]
+    tracks = track_objects(film(poses, SIZE), colors=[COLORS[1]])
+    assert tracks.found.all() and np.ptp(tracks.pose[..., :2], axis=0).max() < 1.5
+    assert np.abs(tracks.pose[:, 0] - truth(poses)[:, 1])[:, :2].max() < 1.5
+
+
 def test_a_colour_that_is_not_there_is_refused():
-    with pytest.raises(ValueError, match="--colors"):
+    with pytest.raises(ValueError, match="#00ff00; .*--threshold"):
         track_objects(film(make_poses(), SIZE), colors=[COLORS[0], (0, 255, 0)])
 
 
