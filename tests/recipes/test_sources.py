@@ -56,7 +56,7 @@ def test_every_source_has_three_world_models_and_two_policies(tmp_path):
     assert len(data) == len(SIZES) * (3 * 3 + 1)
     both, _ = listed(tmp_path)
     assert set(both) == {*names, *data} and len(set(names) & set(data)) == 9, "those of 300 demonstrations"
-    assert {name for name in names if "_tracks_" in name} == set(
+    assert {name for name in names if "reaching_tracks_" in name} == set(
         listed(tmp_path, "--part", "table", "--only", "tracks")[0]
     )
     first, _ = listed(tmp_path, "--world_models", "0", "--part", "table")
