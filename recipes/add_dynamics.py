@@ -116,4 +116,6 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    run_recipe(main, Config, sys.argv)
+    run_recipe(
+        main, Config, sys.argv, stopped="the same command starts again, if the new folder is not there yet"
+    )

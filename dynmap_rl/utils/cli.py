@@ -30,7 +30,9 @@ OUT_OF_MEMORY = re.compile("out of memory|can't allocate memory")
 MEMORY = "not enough memory; reduce the batch (windows, batch, num_envs) or the number of episodes"
 
 
-def run_recipe(main: Callable, config_class: type, argv: Sequence[str]) -> None:
+def run_recipe(
+    main: Callable, config_class: type, argv: Sequence[str], stopped: str = "the same command resumes"
+) -> None:
     """Parse the settings and call ``main(config)``.
 
     An expected error is printed as one line, and the process exits with code 2. ``--debug``, anywhere among the
@@ -40,6 +42,7 @@ def run_recipe(main: Callable, config_class: type, argv: Sequence[str]) -> None:
         main: the recipe.
         config_class: dataclass of its settings; nested dataclasses become options such as ``--eval.split``.
         argv: ``sys.argv``.
+        stopped: what to do after Ctrl-C.
     """
     # Large pages for torch's memory: small ones cost a fifth of a world model's training.
     os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
@@ -49,7 +52,7 @@ def run_recipe(main: Callable, config_class: type, argv: Sequence[str]) -> None:
     try:
         main(parse_settings(config_class, read_arguments(given, config_class)))
     except KeyboardInterrupt:
-        sys.exit("stopped; the same command resumes")
+        sys.exit(f"stopped; {stopped}")
     except Exception as error:
         message = describe_error(error)
         if debug or message is None:

@@ -118,6 +118,16 @@ def test_a_mistake_is_one_line_that_names_the_option(run, capsys, arguments, nam
     assert end.value.code == 2 and error.count("\n") == 1 and name in error
 
 
+def test_ctrl_c_says_how_to_go_on(run):
+    def main(config):
+        raise KeyboardInterrupt
+
+    with pytest.raises(SystemExit, match="stopped; the same command resumes"):
+        run(main=main)
+    with pytest.raises(SystemExit, match="stopped; again"):
+        run_recipe(main, Settings, ["recipes/some.py"], stopped="again")
+
+
 def allocate(config):
     torch.empty(10**15)
 
