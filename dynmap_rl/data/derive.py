@@ -13,15 +13,16 @@ from dynmap_rl.envs.task import BODIES, LAYOUT
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.keys import DYNAMICS
 
+from .camera import Camera, Motion, choose_view, read_motion
 from .demonstrations import META, find_layout, find_meta
 from .format.columns import write_columns
 from .format.reading import find_dataset, read_column, read_info, read_table, spans
 from .normalization import planar_range, value_range
 from .quality import Derived, judge_quality
-from .sources import SOURCES, Camera, Motion, choose_view, read_motion
 from .state import choose_state, read_state
 
 METHODS = ("central", "savgol")
+SOURCES = "state", "centroid", "tracks", "flow", "state,tracks", "state,flow"
 
 
 def differentiate(
@@ -103,7 +104,7 @@ def add_dynamics(
         dataset: local folder or hub id.
         output: the new folder.
         source: ``state``, or from the frames ``centroid``, ``tracks`` or ``flow`` (see
-            :class:`dynmap_rl.data.sources.Camera`), or both: ``state,tracks`` or ``state,flow``.
+            :class:`dynmap_rl.data.camera.Camera`), or both: ``state,tracks`` or ``state,flow``.
         state: column whose entries are positions. They stay as measured, except for unwrapped angles.
         columns: entries of that column; by default all.
         angles: entries among ``columns`` that are angles and jump by ``period``.

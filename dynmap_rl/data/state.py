@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from .camera import Motion
 from .format.reading import read_column, read_table, spans
-from .sources import Motion
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from dynmap_rl.data.camera import Camera, track
 from dynmap_rl.data.format.frames import iterate_frames
 from dynmap_rl.data.format.reading import find_dataset, read_info
-from dynmap_rl.data.sources import Camera, track
 from dynmap_rl.data.tracking import WIDEST
 
 from .figures import plt, save_figure

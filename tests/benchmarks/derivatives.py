@@ -19,10 +19,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from dynmap_rl.data.camera import choose_view, read_motion
 from dynmap_rl.data.demonstrations import load_dataset
 from dynmap_rl.data.derive import differentiate
 from dynmap_rl.data.format.reading import read_info
-from dynmap_rl.data.sources import choose_view, read_motion
 from dynmap_rl.envs.world import CONTROL_DT
 from dynmap_rl.keys import DYNAMICS
 from dynmap_rl.utils.files import write_json

@@ -5,10 +5,10 @@ import pytest
 from films import film, make_poses
 from robot_dataset import make_robot_dataset
 
+from dynmap_rl.data.camera import Camera, Motion, measure, read_motion
 from dynmap_rl.data.derive import differentiate
 from dynmap_rl.data.format.reading import read_info
 from dynmap_rl.data.quality import LIMITS, Derived, judge_quality, quality_text, worst_episode
-from dynmap_rl.data.sources import Camera, Motion, measure, read_motion
 
 NAMES = ["low_x", "low_y", "low_theta", "high_x", "high_y", "high_theta"]
 POSES = make_poses(120)

@@ -1,4 +1,4 @@
-"""Positions from frames, for datasets without dynamics."""
+"""Positions in the frames of a camera, for datasets without dynamics."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from .flow import flow_velocity
 from .format.frames import choose_camera, iterate_frames
 from .tracking import SORTS, WIDEST, Tracks, track_centroid, track_objects
 
-SOURCES = "state", "centroid", "tracks", "flow", "state,tracks", "state,flow"
 BODY = "x", "y", "theta"
 
 
