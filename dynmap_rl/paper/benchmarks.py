@@ -41,6 +41,7 @@ METHODS = {  # by the row of the table: recipe and its options
 }
 UPDATES = {  # of world models and policies, in the place of the defaults; chosen on validation scenes
     "FetchPush": ("--policy.updates", "4000"),
+    "FetchSlide": ("--policy.updates", "4000"),
     "Soccer": ("--world_model.updates", "1800", "--policy.updates", "4000"),
 }
 

@@ -1,4 +1,4 @@
-"""Two tasks of gymnasium-robotics (Plappert et al. 2018) without grasping: a box that is pushed, a puck that is struck."""
+"""Two tasks of gymnasium-robotics (Plappert et al. 2018) without grasping: a box that is pushed, a puck that slides."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 
 from .bodies import Body
-from .fetch_experts import PushExpert, StrikeExpert
+from .fetch_experts import PushExpert, SlideExpert
 from .rendering import Camera
 from .task import MujocoTask, MujocoWorld
 
@@ -69,10 +69,10 @@ class FetchPush(FetchTask):
 
 
 class FetchSlide(FetchTask):
-    """Strike a puck so that it comes to rest at a goal beyond the arm's reach."""
+    """Bring a puck to rest at a goal, most of which are beyond the arm's reach: the puck must slide there."""
 
     name = "fetch_slide"
-    description = "Strike the black puck so that it comes to rest at the red dot."
+    description = "Slide the black puck so that it comes to rest at the red dot."
     environment = "FetchSlide-v4"
     bodies = (Body("puck", "object0", "axis"), Body("hand", "robot0:grip", "none"))
     views = (
@@ -81,4 +81,4 @@ class FetchSlide(FetchTask):
     )
 
     def demonstrator(self, world: MujocoWorld) -> Callable[[], np.ndarray]:
-        return StrikeExpert(world, self.goal(world), self.steps)
+        return SlideExpert(world, self.goal(world))
