@@ -124,7 +124,8 @@ def train(config: Config, dataset: str | Path, folder: Path, seed: int, device: 
     folder.mkdir(parents=True, exist_ok=True)
     log = folder / "lerobot.log"
     print(f"seed {seed}: lerobot-train, see {log}", flush=True)
-    if run_script(Path(sys.executable).with_name("lerobot-train"), arguments, Path.cwd(), log):
+    script, threads = Path(sys.executable).with_name("lerobot-train"), config.compute.threads
+    if run_script(script, arguments, Path.cwd(), log, threads):
         last = (log.read_text(errors="replace").splitlines() or ["no output"])[-1]
         raise ValueError(f"lerobot-train failed; see {log}, which ends with: {last}")
 

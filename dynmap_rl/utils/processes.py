@@ -141,7 +141,9 @@ def start_worker() -> None:
     threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
 
 
-def run_script(script: Path, arguments: list[str], folder: Path, log: Path) -> int:
+def run_script(
+    script: Path, arguments: list[str], folder: Path, log: Path, threads: int | None = None
+) -> int:
     """Run ``python SCRIPT ARGUMENTS`` in a process of its own and return the exit code.
 
     Args:
@@ -149,8 +151,9 @@ def run_script(script: Path, arguments: list[str], folder: Path, log: Path) -> i
         arguments: of the command line.
         folder: working directory.
         log: file to which the output is appended.
+        threads: threads of torch, for a script without an option for them.
     """
-    arguments = str(script), arguments, folder, log
+    arguments = str(script), arguments, folder, log, threads
     process = multiprocessing.get_context("spawn").Process(target=_run_here, args=arguments)
     process.start()
     while process.exitcode is None:  # join alone may miss the end where another thread starts a process
@@ -158,7 +161,9 @@ def run_script(script: Path, arguments: list[str], folder: Path, log: Path) -> i
     return process.exitcode
 
 
-def _run_here(script: str, arguments: list[str], folder: Path, log: Path) -> None:
+def _run_here(script: str, arguments: list[str], folder: Path, log: Path, threads: int | None) -> None:
+    if threads:
+        os.environ["OMP_NUM_THREADS"] = str(threads)  # before torch is imported
     os.environ.setdefault("TQDM_MININTERVAL", "30")  # s; every update of a bar would be a line of the file
     start_worker()
     with open(log, "a") as file:

@@ -93,3 +93,10 @@ def test_a_script_runs_with_its_arguments_in_its_folder(tmp_path):
     (tmp_path / "here").mkdir()
     assert run_script(tmp_path / "script.py", ["--a", "1"], tmp_path / "here", tmp_path / "log") == 3
     assert (tmp_path / "log").read_text() == f"{tmp_path / 'here'} ['--a', '1']\n"
+
+
+def test_a_script_has_the_number_of_threads(tmp_path):
+    (tmp_path / "script.py").write_text("import torch; print(torch.get_num_threads())")
+    for threads in 1, 2:
+        assert run_script(tmp_path / "script.py", [], tmp_path, tmp_path / "log", threads) == 0
+    assert (tmp_path / "log").read_text().split() == ["1", "2"]
