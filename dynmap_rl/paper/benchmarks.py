@@ -18,14 +18,11 @@ from .tables import cause_table, commits_text, join_table
 
 TASKS = "FetchPush", "FetchSlide", "PlateSlide", "Soccer"
 SEEDS = 0, 1, 2  # of weights and batches, of world models and policies
+HAND = {"columns": [0, 1, 2]}  # its recorded positions
 DERIVED = {  # rows whose dynamics need no simulator: name of their dataset, and how its columns are derived
-    "RGB+[P+V] of the hand": ("hand", {"columns": [0, 1, 2]}),  # of its recorded positions
-    "RGB+[P+V], tracked": (
-        "tracks",
-        {"source": "tracks", "objects": 2},
-    ),  # of two things that move in the frames
-    # of the hand, and of the object by its colour
-    "RGB+[P+V], hand and color": ("color", {"source": "state,tracks", "columns": [0, 1, 2], "point": True}),
+    "RGB+[P+V] of the hand": ("hand", HAND),
+    "RGB+[P+V], tracked": ("tracks", {"source": "tracks", "objects": 2}),
+    "RGB+[P+V], hand and color": ("color", HAND | {"source": "state,tracks", "point": True}),
 }
 COLORS = {"FetchPush": {"colors": ["#1c1c1c"], "threshold": 24}}  # of the object, where it has one of its own
 METHODS = {  # by the row of the table: recipe and its options
@@ -87,7 +84,7 @@ def list_benchmarks(episodes: int = 500) -> dict[tuple[str, str, int], Run]:
     runs = {}
     for task in TASKS:
         for method, (recipe, options) in METHODS.items():
-            if method.endswith("color") and task not in COLORS:
+            if method in DERIVED and derived_columns(task, method) is None:
                 continue
             for seed in SEEDS:
                 arguments = ["--task", f"mujoco:{task}", *options, "--seeds", str(seed)]
@@ -113,11 +110,18 @@ def derived_dataset(task: str, method: str) -> Path:
     return Path("datasets") / f"{name}_{DERIVED[method][0]}"
 
 
+def derived_columns(task: str, method: str) -> dict | None:
+    """Return the arguments that derive a row's columns, or None if the task's object has no colour to find it by."""
+    name, columns = DERIVED[method]
+    if name != "color":
+        return columns
+    return columns | COLORS[task] if task in COLORS else None
+
+
 def derive_dataset(task: str, recording: Path, method: str, folder: Path) -> None:
     """Derive a dataset from a recording if it is missing; ``NAME.quality.json`` beside it has its quality."""
     if not folder.exists():
-        columns = DERIVED[method][1] | (COLORS[task] if method.endswith("color") else {})
-        found = add_dynamics(recording, folder, **columns, replace=True)
+        found = add_dynamics(recording, folder, **derived_columns(task, method), replace=True)
         write_json(quality_file(folder), found["quality"])
 
 
