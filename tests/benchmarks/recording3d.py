@@ -4,8 +4,9 @@
     uv run --extra mujoco python tests/benchmarks/recording3d.py --tasks Soccer --episodes 5 --output found.json
 
 ``ours`` records a dataset, with resets, failures of the expert, dynamics, frames and files. ``theirs`` takes random actions
-in the benchmark's environment and calls ``env.render()``, at the same size. Both have one thread, one after the other, by
-the time of the processor (which leaves out other load) and by the clock; loading the model, once a process, is left out.
+in the benchmark's environment and calls ``env.render()``, at the same size. Both have one thread, and turns of some seconds,
+so that a machine whose speed changes is equally fast for both. The rates are by the time of the processor (which leaves out
+other load) and by the clock; loading the model, once a process, is left out.
 Writes ``recipes/results/measurements/recording3d.json``.
 """
 
@@ -36,10 +37,14 @@ SIZE = 64
 
 
 def measure(run: Callable[[], int]) -> dict[str, float]:
-    """Return frames a second by the processor's time and by the clock; ``run`` returns the number of frames."""
+    """Return seconds by the processor's time and by the clock, and the number of frames, which ``run`` returns."""
     clock, cpu = time.perf_counter(), time.process_time()
     frames = run()
-    return {"cpu": frames / (time.process_time() - cpu), "clock": frames / (time.perf_counter() - clock)}
+    return {
+        "frames": frames,
+        "cpu": time.process_time() - cpu,
+        "clock": time.perf_counter() - clock,
+    }
 
 
 def make_theirs(task: str) -> gymnasium.Env:
@@ -91,24 +96,37 @@ def render(task: str, frames: int) -> dict[str, float]:
     return measure(run)
 
 
-def compare(task: str, episodes: int, frames: int) -> dict:
+def compare(task: str, episodes: int, frames: int, rounds: int) -> dict:
     """Measure a task, each part in a process of its own: renderers of one process share their settings."""
-    found = {}
-    for name, run, amount in (("ours", record, episodes), ("theirs", render, frames)):
-        with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-            found[name] = pool.submit(run, task, amount).result()
-    return found | {"ratio": found["ours"]["cpu"] / found["theirs"]["cpu"]}
+    parts = {"ours": (record, task, episodes), "theirs": (render, task, frames)}
+    found = {name: [] for name in parts}
+    with (
+        ProcessPoolExecutor(1, get_context("spawn")) as first,
+        ProcessPoolExecutor(1, get_context("spawn")) as second,
+    ):
+        for _ in range(rounds):
+            for pool, (name, call) in zip((first, second), parts.items(), strict=True):
+                found[name].append(pool.submit(*call).result())
+    totals = {name: {key: sum(row[key] for row in rows) for key in rows[0]} for name, rows in found.items()}
+    rates = {name: {key: t["frames"] / t[key] for key in ("cpu", "clock")} for name, t in totals.items()}
+    return rates | {"ratio": rates["ours"]["cpu"] / rates["theirs"]["cpu"]}
 
 
 def main() -> None:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--tasks", default=",".join(TASKS))
-    parser.add_argument("--episodes", type=int, default=20, help="episodes that are recorded")
-    parser.add_argument("--frames", type=int, default=100, help="frames of the benchmark's own rendering")
+    parser.add_argument("--episodes", type=int, default=8, help="episodes that are recorded in a round")
+    parser.add_argument(
+        "--frames", type=int, default=30, help="frames of the benchmark's own rendering in a round"
+    )
+    parser.add_argument("--rounds", type=int, default=3, help="turns of both")
     parser.add_argument("--output", type=Path, default=RESULTS)
     options = parser.parse_args()
-    rows = {task: compare(task, options.episodes, options.frames) for task in options.tasks.split(",")}
+    rows = {
+        task: compare(task, options.episodes, options.frames, options.rounds)
+        for task in options.tasks.split(",")
+    }
     for task, row in rows.items():
         print(f"{task}: {row['ours']['cpu']:.0f} frames/s of one core, theirs {row['theirs']['cpu']:.0f}")
     write_json(options.output, {"tasks": rows, "command": command_line(sys.argv), "commit": find_commit()})
