@@ -69,7 +69,7 @@ class FetchPush(FetchTask):
 
 
 class FetchSlide(FetchTask):
-    """Bring a puck to rest at a goal, most of which are beyond the arm's reach: the puck must slide there."""
+    """Bring a puck to rest at a goal, which is often beyond the arm's reach, so that the puck must slide there."""
 
     name = "fetch_slide"
     description = "Slide the black puck so that it comes to rest at the red dot."

@@ -82,7 +82,7 @@ class SlideExpert:
     GAP = 0.058  # m, from the hand behind the puck to its middle
     LEAD = 0.1  # s, by which the hand is ahead of a puck that still moves sideways
     TOUCH, LAUNCH_STEPS = 4, 2  # steps
-    CHANGE = 0.25  # of the action in a step, with which the puck does not slip
+    CHANGE = 0.25  # of the action from step to step, with which the puck does not slip
     SLOW = 0.12  # m/s, of a puck that is let go
 
     def __init__(self, world: MujocoWorld, goal: np.ndarray):
@@ -122,7 +122,10 @@ class SlideExpert:
     def _bring(self, place: np.ndarray, gain: float, tolerance: float = 0) -> Iterator[np.ndarray]:
         """Move the hand and the puck under it to a place ``[2]`` (m); let the puck go there if there is a tolerance (m)."""
         action = np.zeros(2)
-        while np.linalg.norm(way := place - self.puck) > tolerance or self._speed() > self.SLOW:
+        while (
+            np.linalg.norm(way := place - self.puck) > tolerance
+            or np.linalg.norm(self.world.velocity[:2]) > self.SLOW
+        ):
             change = gain * way / max(1, gain * np.abs(way).max()) - action
             action = action + change * min(1, self.CHANGE / max(np.linalg.norm(change), 1e-9))
             yield np.append(action, [20 * (self.PRESSED - self.hand[2]), 0]).clip(-1, 1)
@@ -144,6 +147,3 @@ class SlideExpert:
         """Return the action in x that launches the puck to the goal: the inverse of a parabola, fitted to 200 launches."""
         far = self.goal[0] - 1.185
         return float(np.clip((np.sqrt(0.15**2 + 4 * 0.31 * far) - 0.15) / (2 * 0.31), 0, 1))
-
-    def _speed(self) -> float:
-        return float(np.linalg.norm(self.world.velocity[:2]))
