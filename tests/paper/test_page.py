@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,7 +11,9 @@ import pytest
 from dynmap_rl.evaluation.protocol import result_rows
 from dynmap_rl.evaluation.statistics import shared_interval
 from dynmap_rl.paper import page
+from dynmap_rl.paper.benchmarks import benchmark_page, benchmark_rows
 from dynmap_rl.paper.cells import list_runs
+from dynmap_rl.paper.delays import delay_page, read_delays
 from dynmap_rl.paper.page import (
     MARKS,
     markdown_page,
@@ -19,6 +22,7 @@ from dynmap_rl.paper.page import (
     replace_block,
     write_results_page,
 )
+from dynmap_rl.paper.source_page import write_source_page
 from dynmap_rl.utils.files import read_json
 
 ROOT = Path(__file__).parents[2]
@@ -32,6 +36,18 @@ def test_the_readme_of_the_results_is_generated():
 def test_the_table_of_the_main_readme_is_generated():
     text = (ROOT / "README.md").read_text()
     assert text == replace_block(text, markdown_runs(RESULTS)) and MARKS[0] in text
+
+
+@pytest.mark.parametrize("folder", ["benchmarks3d", "delays", "sources_plain"])
+def test_the_pages_of_the_other_grids_are_generated(folder, tmp_path):
+    results = Path(shutil.copytree(RESULTS / folder, tmp_path / folder))
+    if folder == "benchmarks3d":
+        text = benchmark_page(benchmark_rows(results), results)
+    elif folder == "delays":
+        text = delay_page(read_delays(results))
+    else:
+        text = write_source_page(results, ["balance_reaching"], "plain")[-1].read_text()
+    assert text == (RESULTS / folder / "README.md").read_text()
 
 
 def test_everything_is_described():
