@@ -127,7 +127,7 @@ def track_objects(
         labels = _split(frames, _moving(frames, changed, ever), objects, threshold)
     else:
         labels, objects = _find_colors(frames, ever, colors, threshold), len(colors)
-    regions = [[_measure(frame_labels == n) for n in range(1, objects + 1)] for frame_labels in labels]
+    regions = [[_measure(frame_labels, n) for n in range(1, objects + 1)] for frame_labels in labels]
     area = np.array([[region[1] for region in row] for row in regions], float)
     found = area >= np.array([_faintest(column) for column in area.T])
     if missing := np.flatnonzero(~found.any(0)).tolist():
@@ -165,9 +165,8 @@ def fill_gaps(values: np.ndarray, found: np.ndarray) -> np.ndarray:
 def _moving(frames: np.ndarray, changed: np.ndarray, ever: np.ndarray) -> np.ndarray:
     """Return masks ``[T, height, width]`` of what moves, by colour."""
     colors = (frames // (256 // BINS)).astype(np.int32) @ np.array([BINS**2, BINS, 1], np.int32)
-    moving, still = (
-        np.bincount(colors[where], minlength=BINS**3) for where in (changed, _every(frames, ~ever))
-    )
+    never = np.broadcast_to(~ever, colors.shape)
+    moving, still = (np.bincount(colors[where], minlength=BINS**3) for where in (changed, never))
     likely = moving / moving.sum() > still / still.sum()
     masks = likely[colors]
     for mask in masks:  # what never changes may have the same colour
@@ -197,10 +196,6 @@ def _find_colors(
         if not (moving == n).any():  # the object rests in the whole episode
             moving[seen == n] = n
     return moving
-
-
-def _every(frames: np.ndarray, where: np.ndarray) -> np.ndarray:
-    return np.broadcast_to(where, frames.shape[:3])
 
 
 def _split(frames: np.ndarray, masks: np.ndarray, objects: int, threshold: int) -> np.ndarray:
@@ -252,12 +247,14 @@ def _faintest(area: np.ndarray) -> float:
     return max(4.0, FAINTEST * float(np.median(area[area > 0]))) if area.any() else np.inf
 
 
-def _measure(mask: np.ndarray) -> tuple[tuple[float, float, float], int, bool]:
-    """Return pose (pixels, rad), area, and whether it touches the border, of the largest region of a mask."""
+def _measure(labels: np.ndarray, n: int) -> tuple[tuple[float, float, float], int, bool]:
+    """Return pose (pixels, rad), area and contact with the border of object n's largest region; clear its others."""
+    mask = labels == n
     count, regions, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     if count == 1:
         return (0.0, 0.0, 0.0), 0, False
     largest = 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
+    labels[mask & (regions != largest)] = 0
     moments = cv2.moments((regions == largest).astype(np.uint8), binaryImage=True)
     x, y = moments["m10"] / moments["m00"], moments["m01"] / moments["m00"]
     angle = 0.5 * np.arctan2(2 * moments["mu11"], moments["mu20"] - moments["mu02"])

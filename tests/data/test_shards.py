@@ -1,6 +1,7 @@
 """Shards: which episodes they keep, and what is stored beside the columns."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -63,8 +64,10 @@ def test_failures_are_replaced_by_the_next_candidates(tmp_path, monkeypatch):
     assert episodes.shape == (5, 120)
     assert [seed for batch in rolled for seed in batch] == list(range(500, 500 + sum(map(len, rolled))))
     monkeypatch.setattr(module, "CANDIDATES_PER_SHARD", 10)
-    with pytest.raises(ValueError, match="train a better expert"):
-        module._roll_out_shard(shard)
+    for scripted, advice in ((False, "train a better expert"), (True, "improve its demonstrator")):
+        monkeypatch.setattr(module, "get_task", lambda name, scripted=scripted: SimpleNamespace(is_scripted=scripted))
+        with pytest.raises(ValueError, match=advice):
+            module._roll_out_shard(shard)
 
 
 def test_shards_never_share_a_scene(tmp_path):

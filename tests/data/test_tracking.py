@@ -45,6 +45,17 @@ def test_velocities_by_flow_are_those_of_the_motion():
     assert np.abs(velocity - expected)[..., :2].mean() < 0.4 * np.abs(expected[..., :2]).mean()
 
 
+def test_velocities_by_flow_do_not_read_a_second_region_of_the_colour():
+    poses = make_poses(40)
+    alone = film(poses, SIZE)
+    both = alone.copy()
+    for t, frame in enumerate(both):  # a smaller square that moves up
+        frame[60 - t : 68 - t, 84:92] = COLORS[1]
+    tracks = [track_objects(frames, colors=[COLORS[1]]) for frames in (alone, both)]
+    assert np.array_equal(tracks[0].labels, tracks[1].labels)
+    np.testing.assert_allclose(flow_velocity(alone, tracks[0]), flow_velocity(both, tracks[1]), atol=0.1)
+
+
 def test_an_object_that_is_hidden_is_interpolated():
     poses = make_poses()
     frames = film(poses, SIZE)

@@ -71,10 +71,14 @@ def test_parts_of_a_body_belong_to_it():
     arm, part = (model.body(name).id for name in ("arm", "part"))
     assert find_parts(model, ("arm",)) >= {arm, part}
     assert find_parts(model, ("part",)) & {arm, part} == {part}
-    assert not find_parts(model, ()) & {arm, part}
+    assert not find_parts(model, ())
+    with pytest.raises(ValueError, match="'leg'.*'arm'"):
+        find_parts(model, ("leg",))
 
 
 def test_a_machine_that_cannot_draw_says_what_to_install(monkeypatch):
-    monkeypatch.setattr(rendering, "BACKENDS", ("nowhere",))
-    with pytest.raises(OSError, match="libosmesa6"):
-        FrameRenderer(make_model(10), CAMERAS, 64)
+    monkeypatch.setattr(rendering, "BACKENDS", ("nowhere", "nothing"))
+    for library, backend in (("libEGL.so.1", "nowhere"), (None, "nothing")):
+        monkeypatch.setattr(rendering, "find_library", lambda name, library=library: library)
+        with pytest.raises(OSError, match=rf"\({backend}: .*libosmesa6"):
+            FrameRenderer(make_model(10), CAMERAS, 64)

@@ -1,5 +1,6 @@
 """A Gymnasium environment with MuJoCo as a task: one of one's own, and those of the benchmarks."""
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -124,6 +125,12 @@ def test_an_environment_that_does_not_fit_is_refused(own_task, monkeypatch):  # 
     with pytest.raises(ValueError, match="actions of 2 entries"):
         task.begin(0)
     monkeypatch.setattr(type(task), "action", ("x",))
+    env = task.make()
+    env.action_space = gymnasium.spaces.Box(0, 1, (1,), np.float32)
+    monkeypatch.setattr(type(task), "make", lambda self: env)
+    with pytest.raises(ValueError, match="actions of 1 entries"):
+        task.begin(0)
+    monkeypatch.undo()
     monkeypatch.setattr(type(task), "is_solved", lambda self, world: True)
     with pytest.raises(ValueError, match="starts that are not solved"):
         task.begin(0)

@@ -138,3 +138,17 @@ def test_chunks_of_several_observations_are_not_cut(tmp_path):
     write_json(policy / "config.json", settings | {"n_obs_steps": 2})
     with pytest.raises(ValueError, match="2 observations"):
         LeRobotActor(policy, cut=True)
+
+
+def test_frames_are_those_of_the_policys_cameras(tmp_path):
+    actor = LeRobotActor(export_to_lerobot("balance_reaching", tmp_path))
+    features, seen = actor.policy.config.input_features, []
+    features["observation.images.side"] = features.pop("observation.images.front")
+    actor.policy.select_action = lambda batch: seen.append(batch) or torch.zeros(2, 3)
+    frames = torch.randint(0, 256, (2, 3, 64, 128), dtype=torch.uint8)
+    td = TensorDict({"pixels": frames[..., :64], "agent_pos": torch.zeros(2, 5)}, [2])
+    assert actor(td)["action"].shape == (2, 3)
+    assert torch.equal(seen[0]["observation.images.side"], td["pixels"] / 255)
+    assert "observation.images.front" not in seen[0]
+    with pytest.raises(ValueError, match="2 cameras"):
+        actor(td.set("pixels", frames))

@@ -11,6 +11,7 @@ import importlib
 import os
 import weakref
 from collections.abc import Sequence
+from ctypes.util import find_library
 from dataclasses import dataclass
 
 import mujoco
@@ -104,21 +105,22 @@ def _free(canvas, context: mujoco.MjrContext) -> None:
 def make_canvas(size: int):
     """Return an OpenGL context of ``size`` x ``size`` pixels that needs no display.
 
-    The environment variable ``MUJOCO_GL`` chooses ``egl`` or ``osmesa``; otherwise the first that works is used.
+    The environment variable ``MUJOCO_GL`` chooses ``egl`` or ``osmesa``; otherwise it is EGL where its library is. Only one
+    of them can be loaded in a process.
 
     Raises:
-        OSError: none works.
+        OSError: it does not work.
     """
-    wanted, reasons = os.environ.get("MUJOCO_GL", "").lower(), []
-    for backend in (wanted,) if wanted in BACKENDS else BACKENDS:
-        try:
-            return importlib.import_module(f"mujoco.{backend}").GLContext(size, size)
-        except Exception as error:  # every backend raises its own kinds
-            reasons.append(f"{backend}: {error}")
-    raise OSError(
-        f"MuJoCo cannot draw without a display here ({'; '.join(reasons)}); install the Debian packages libegl1 and "
-        "libgl1-mesa-dri, or libosmesa6"
-    )
+    backend = os.environ.get("MUJOCO_GL", "").lower()
+    if backend not in BACKENDS:
+        backend = BACKENDS[0] if find_library("EGL") else BACKENDS[1]
+    try:
+        return importlib.import_module(f"mujoco.{backend}").GLContext(size, size)
+    except Exception as error:  # every backend raises its own kinds
+        raise OSError(
+            f"MuJoCo cannot draw without a display here ({backend}: {error}); install the Debian packages libegl1 and "
+            "libgl1-mesa-dri, or install libosmesa6 and set MUJOCO_GL=osmesa"
+        ) from error
 
 
 def find_heavy(model: mujoco.MjModel, keep: Sequence[str] = ()) -> list[int]:
@@ -135,8 +137,15 @@ def find_heavy(model: mujoco.MjModel, keep: Sequence[str] = ()) -> list[int]:
 
 
 def find_parts(model: mujoco.MjModel, names: Sequence[str]) -> set[int]:
-    """Return the numbers of the bodies of some names, and of all bodies that are attached to them."""
-    parts = {mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) for name in names}
+    """Return the numbers of the bodies of some names, and of all bodies that are attached to them.
+
+    Raises:
+        ValueError: the model has no body of a name.
+    """
+    numbers = {model.body(number).name: number for number in range(model.nbody)}
+    if missing := [name for name in names if name not in numbers]:
+        raise ValueError(f"the model must have the bodies {missing}, got the bodies {list(numbers)}")
+    parts = {numbers[name] for name in names}
     for body, parent in enumerate(model.body_parentid.tolist()):  # a parent comes before its parts
         if parent in parts and body:
             parts.add(body)

@@ -62,13 +62,14 @@ class MujocoTask(BaseTask):
 
     A subclass must define ``name``, ``description``, ``bodies``, ``views``, ``steps``, ``fps``, ``make`` and ``goal``.
     The environment may be any whose ``unwrapped`` has ``model`` and ``data`` and whose actions are a box that is
-    symmetric about 0. Success is ``info["is_success"]`` or ``info["success"]`` after a step.
+    symmetric about 0. Success is ``info["is_success"]`` or ``info["success"]`` after a step; override :meth:`is_solved`
+    where ``reset`` does not return it and a start may be solved already.
 
     Args:
         image_size: side of a frame in pixels: 64, 96 or 128.
         cameras: number of cameras, the first of ``views``.
-        arm: draw meshes of more than 2,000 faces, which slows recording down by a factor of 2 to 3. Without them the
-            frames show the gripper alone, and a policy that reads frames cannot see the arm.
+        arm: draw meshes of more than 2,000 faces, which slows recording down by a factor of 2 to 3. Parts that are made
+            of such meshes are not visible otherwise; of the arm of Meta-World the hand remains.
 
     Attributes:
         bodies: bodies whose dynamics are recorded; first the object whose distance to the goal is judged, last the one
@@ -173,7 +174,8 @@ class MujocoTask(BaseTask):
     def _make_world(self) -> MujocoWorld:
         env = self.make()
         world, size = MujocoWorld(env, self.bodies, 1 / self.fps), len(self.action)
-        if env.action_space.shape != (size,) or not np.allclose(env.action_space.high, self.action_limit):
+        box = env.action_space
+        if box.shape != (size,) or not np.allclose([box.high, -box.low], self.action_limit):
             raise ValueError(
                 f"{self.name} must have actions of {size} entries within {self.action_limit}, got {env.action_space}"
             )

@@ -11,7 +11,6 @@ from lerobot.utils.constants import OBS_STATE
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from dynmap_rl.keys import CAMERA
 from dynmap_rl.utils.hub import first_line
 
 
@@ -19,8 +18,9 @@ class LeRobotActor(TensorDictModuleBase):
     """Trained LeRobot policy as a TensorDict policy, one time step a call.
 
     It reads ``pixels`` ``[B, 3, S, cameras * S]`` and ``agent_pos`` and writes ``action`` ``[B, A]``, with the sizes of the
-    task's layout (see :class:`dynmap_rl.envs.Layout`). The cameras are those of the policy, in this order. Its memory (chunks of actions, past observations) belongs to one batch of episodes, which all begin at the same time:
-    call :meth:`reset` before the first step of the next batch.
+    task's layout (see :class:`dynmap_rl.envs.Layout`). The cameras are those of the policy, in this order. Its memory
+    (chunks of actions, past observations) belongs to one batch of episodes, which all begin at the same time: call
+    :meth:`reset` before the first step of the next batch.
 
     Args:
         path: ``pretrained_model`` folder of ``lerobot-train``, or the id of a policy on the Hugging Face hub.
@@ -79,7 +79,9 @@ class LeRobotActor(TensorDictModuleBase):
         before, after = self.processors
         frames = tensordict["pixels"].float() / 255
         frames = frames.split(frames.shape[-2], -1)
-        names = list(self.policy.config.image_features) if len(frames) > 1 else [CAMERA]
+        names = list(self.policy.config.image_features)
+        if len(names) != len(frames):
+            raise ValueError(f"the policy must read {len(frames)} cameras, but it reads {', '.join(names) or 'none'}")
         observation = dict(zip(names, frames, strict=True)) | {OBS_STATE: tensordict["agent_pos"]}
         batch = before({**observation, "task": [self.instruction] * len(tensordict)})
         action = self._cut(batch, tensordict["delay"]) if self.cut else self.policy.select_action(batch)
