@@ -81,7 +81,9 @@ class LeRobotActor(TensorDictModuleBase):
         frames = frames.split(frames.shape[-2], -1)
         names = list(self.policy.config.image_features)
         if len(names) != len(frames):
-            raise ValueError(f"the policy must read {len(frames)} cameras, but it reads {', '.join(names) or 'none'}")
+            raise ValueError(
+                f"the policy must read {len(frames)} cameras, but it reads {', '.join(names) or 'none'}"
+            )
         observation = dict(zip(names, frames, strict=True)) | {OBS_STATE: tensordict["agent_pos"]}
         batch = before({**observation, "task": [self.instruction] * len(tensordict)})
         action = self._cut(batch, tensordict["delay"]) if self.cut else self.policy.select_action(batch)
