@@ -6,6 +6,7 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_policy, make_policy_config, make_pre_post_processors
 from tensordict import TensorDict
 
+from dynmap_rl.data.derive import add_dynamics
 from dynmap_rl.integrations.lerobot.actor import LeRobotActor
 from dynmap_rl.integrations.lerobot.configuration_dynmap import DynmapConfig
 from dynmap_rl.integrations.lerobot.environment import DynmapEnvConfig
@@ -25,8 +26,8 @@ from dynmap_rl.utils.files import read_json, write_json
 from dynmap_rl.utils.weights import fingerprint
 
 
-def make_run(folder, kind, architecture="glimpse", goal=2):
-    sizes = {"action": 3, "goal": goal, "position": 6}
+def make_run(folder, kind, architecture="glimpse", goal=2, position=6):
+    sizes = {"action": 3, "goal": goal, "position": position}
     meta = {name: {"low": [-1.0] * n, "high": [2.0] * n} for name, n in sizes.items()}
     world_model = make_world_model(meta, ("position",), 16, 24, architecture)
     policy = make_own_policy(meta, kind, world_model, width=20)
@@ -35,10 +36,12 @@ def make_run(folder, kind, architecture="glimpse", goal=2):
     return world_model, policy
 
 
-@pytest.mark.parametrize(("kind", "architecture"), [("recurrent", "glimpse"), ("feedforward", "plain")])
-def test_a_run_exports_to_lerobot_and_back(tmp_path, kind, architecture):
+@pytest.mark.parametrize(
+    ("kind", "architecture", "position"), [("recurrent", "glimpse", 6), ("feedforward", "plain", 3)]
+)
+def test_a_run_exports_to_lerobot_and_back(tmp_path, kind, architecture, position):
     run, exported, back = tmp_path / "run", tmp_path / "pretrained_model", tmp_path / "back"
-    world_model, policy = make_run(run, kind, architecture)
+    world_model, policy = make_run(run, kind, architecture, position=position)
     export_to_lerobot(run, exported, seed=1)
     theirs = make_policy(config_of(exported), env_cfg=DynmapEnvConfig())
     assert type(theirs) is DynmapPolicy
@@ -92,6 +95,16 @@ def test_a_policy_of_lerobot_train_has_the_task_of_its_dataset(recording, tmp_pa
     run = import_from_lerobot(tmp_path / "pretrained_model", tmp_path / "run")
     assert task_of_run(run) == "balance_reaching"
     assert load_source(run)[1] == {"task": "balance_reaching", "training": "joint"}
+
+
+def test_a_policy_of_lerobot_train_has_the_sizes_of_its_dataset(recording, tmp_path):
+    add_dynamics(recording, tmp_path / "command", columns=(0, 1, 2), replace=True)
+    dataset = LeRobotDataset("user/small", root=tmp_path / "command", video_backend="pyav")
+    policy = make_policy(make_policy_config("dynmap", device="cpu", push_to_hub=False), ds_meta=dataset.meta)
+    policy.save_pretrained(tmp_path / "pretrained_model")
+    again = DynmapPolicy.from_pretrained(tmp_path / "pretrained_model", strict=True)
+    assert again.config.sizes == {"action": 3, "goal": 2, "position": 3, "velocity": 3, "acceleration": 3}
+    assert fingerprint(again.world_model) == fingerprint(policy.world_model)
 
 
 def config_of(folder):

@@ -8,9 +8,11 @@ from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 
-from dynmap_rl.keys import FRAME_SHAPE
+from dynmap_rl.keys import DYNAMICS, FRAME_SHAPE
 from dynmap_rl.modules.checkpoints import check_policy
 from dynmap_rl.modules.supervision import parse_supervision
+
+GOAL = 2  # entries of the goal, x and y
 
 
 @PreTrainedConfig.register_subclass("dynmap")
@@ -43,6 +45,7 @@ class DynmapConfig(PreTrainedConfig):
         chunk_size: actions that ``predict_action_chunk`` returns.
         optimizer_lr: learning rate of AdamW.
         optimizer_weight_decay: weight decay of AdamW.
+        sizes: numbers of entries of action, goal and dynamics; written by training.
         task: task of the dataset; written by training.
         source: origin of the world model (see :func:`dynmap_rl.runs.load_source`); written by training.
 
@@ -71,6 +74,9 @@ class DynmapConfig(PreTrainedConfig):
     chunk_size: int = 20
     optimizer_lr: float = 2e-3
     optimizer_weight_decay: float = 1e-4
+    sizes: dict[str, int] = field(
+        default_factory=lambda: {"action": 3, "goal": GOAL, **dict.fromkeys(DYNAMICS, 6)}
+    )
     task: str | None = None
     source: dict[str, str] | None = None
     # The modules hold constants of their own, which are saved with the weights.

@@ -14,7 +14,7 @@ from dynmap_rl.runs.lookup import find_run, load_actor
 from dynmap_rl.utils.files import read_json, write_json
 
 from .configuration_dynmap import DynmapConfig
-from .modeling_dynmap import SIZES, DynmapPolicy
+from .modeling_dynmap import DynmapPolicy
 from .processor_dynmap import make_dynmap_pre_post_processors
 
 
@@ -37,9 +37,9 @@ def export_to_lerobot(run: str | Path, folder: str | Path, seed: int = 0) -> Pat
     actor = load_actor(run, seed)
     world_model, policy = actor.world_model, actor.policy
     sizes = {"action": policy.action.size, "goal": policy.goal.size}
-    sizes |= {name: n.size for name, n in world_model.dynamics_decoder.normalizers.items()}
-    if other := {name: size for name, size in sizes.items() if size != SIZES[name]}:
-        raise ValueError(f"{run} must be a run of one of the tasks, got other sizes: {other}")
+    if other := {name: size for name, size in sizes.items() if size != DynmapConfig().sizes[name]}:
+        raise ValueError(f"{run} must be a run of a task of cart and block, got other sizes: {other}")
+    dynamics = {name: n.size for name, n in world_model.dynamics_decoder.normalizers.items()}
     files = run / "config.json", run / "eval.json"
     settings, results = (read_json(file) if file.exists() else {} for file in files)
     config = DynmapConfig(
@@ -51,6 +51,7 @@ def export_to_lerobot(run: str | Path, folder: str | Path, seed: int = 0) -> Pat
         hidden_size=world_model.hidden_size,
         architecture=world_model.architecture,
         width=policy.width,
+        sizes=DynmapConfig().sizes | dynamics,
         input_features={
             CAMERA: PolicyFeature(FeatureType.VISUAL, (FRAME_SHAPE[2], *FRAME_SHAPE[:2])),
             OBS_STATE: PolicyFeature(FeatureType.STATE, (5,)),

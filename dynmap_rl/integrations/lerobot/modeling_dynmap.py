@@ -21,10 +21,7 @@ from dynmap_rl.objectives.joint import JointLoss
 from dynmap_rl.objectives.world_model import WorldModelLoss
 
 from .columns import find_constants, find_task, is_symmetric, read_columns
-from .configuration_dynmap import DynmapConfig
-
-SIZES = {"action": 3, "goal": 2, **dict.fromkeys(DYNAMICS, 6)}
-
+from .configuration_dynmap import GOAL, DynmapConfig
 
 class DynmapPolicy(PreTrainedPolicy):
     """World model, and the policy that acts on its states.
@@ -47,11 +44,16 @@ class DynmapPolicy(PreTrainedPolicy):
         config.validate_features()
         self.config = config
         # Where there is no dataset, weights from a checkpoint overwrite these.
-        constants = {name: {"low": [-1.0] * size, "high": [1.0] * size} for name, size in SIZES.items()}
+        constants = {name: {"low": [-1.0] * n, "high": [1.0] * n} for name, n in config.sizes.items()}
         self.trainable, self.symmetric = dataset_meta is not None, bool(config.symmetric)
         if dataset_meta is not None:
             columns = read_columns(dataset_meta.root)
             constants = find_constants(dataset_meta.root, columns)
+            config.sizes = {name: len(constants[name]["low"]) for name in config.sizes}
+            if config.sizes["goal"] != GOAL:
+                raise ValueError(
+                    f"{dataset_meta.root} must have a goal of {GOAL} entries (x, y), got {config.sizes['goal']}"
+                )
             task = find_task(dataset_meta.root)
             if config.symmetric is None:
                 self.symmetric = is_symmetric(task)
@@ -120,7 +122,7 @@ class DynmapPolicy(PreTrainedPolicy):
         data = {
             "pixels": to_bytes(batch[self.config.camera]),
             "action": action,
-            "goal": batch[OBS_STATE][..., -2:],
+            "goal": batch[OBS_STATE][..., -GOAL:],
             "dynamics": {name: getattr(self, name)[rows] for name in DYNAMICS},
             "disturbed": self.disturbed[rows],
             ("collector", "mask"): ~beyond,
@@ -148,7 +150,7 @@ class DynmapPolicy(PreTrainedPolicy):
         self.eval()
         pixels = to_bytes(batch[self.config.camera])
         td = TensorDict({}, [len(pixels)]) if self._memory is None else self._memory
-        td = td.set("pixels", pixels).set("goal", batch[OBS_STATE][:, -2:])
+        td = td.set("pixels", pixels).set("goal", batch[OBS_STATE][:, -GOAL:])
         td = DelayedActor(self._chunks.actor, self.config.delay)(td)
         self._memory = td["next"]
         return td["action"]
@@ -165,7 +167,7 @@ class DynmapPolicy(PreTrainedPolicy):
         state = batch[OBS_STATE]
         numbered = state.shape[-1] > self.config.robot_state_feature.shape[0]
         step = int(state[0, 0]) if numbered else None
-        return self._chunks.act(to_bytes(batch[self.config.camera]), state[:, -2:], step)
+        return self._chunks.act(to_bytes(batch[self.config.camera]), state[:, -GOAL:], step)
 
 
 def to_bytes(pixels: torch.Tensor) -> torch.Tensor:
