@@ -22,6 +22,7 @@ from .normalization import normalization_constants
 
 FORMAT = 4  # version of what is recorded, and how
 META = "meta/dynmap.json"
+DERIVED = "meta/dynamics.json"  # in datasets whose dynamics were derived: how, and how good they are
 RANGE = {"low": [Real], "high": [Real]}
 META_FORM = {
     "format": int,

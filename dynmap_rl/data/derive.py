@@ -14,7 +14,7 @@ from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.keys import DYNAMICS
 
 from .camera import Camera, Motion, choose_view, read_motion
-from .demonstrations import META, find_layout, find_meta
+from .demonstrations import DERIVED, META, find_layout, find_meta
 from .format.columns import write_columns
 from .format.reading import find_dataset, read_column, read_info, read_table, spans
 from .normalization import planar_range, value_range
@@ -98,7 +98,8 @@ def add_dynamics(
     The columns (float32) are computed for one episode at a time, in float64, with the times of the column ``timestamp``.
     The new folder appears when it is complete. Videos are hard-linked where the file system can; all other files are
     copied. A recording of a task stays one, and can be trained on with the recipes of the tasks: its constants of
-    normalisation and the names of its dynamics are written anew.
+    normalisation and the names of its dynamics are written anew. ``meta/dynamics.json`` says how the columns were derived,
+    and has their quality.
 
     Args:
         dataset: local folder or hub id.
@@ -177,14 +178,17 @@ def add_dynamics(
             derived.append(Derived(episode, own_names, found["position"], found["velocity"], motion))
     new = {f"dynamics.{q}": v.astype(np.float32) for q, v in values.items()}
     meta = _describe(meta, planar, names, values, rows) if meta else None
-    write_columns(root, output, info, table, new, names, {META: meta})
     there = {
         q: read_column(root, info, table, f"dynamics.{q}", np.float64).numpy()
         for q in DYNAMICS
         if f"dynamics.{q}" in old
     }
     differences = {q: np.abs(values[q] - v).mean(0) for q, v in there.items() if v.shape == values[q].shape}
-    return {"differences": differences, "quality": judge_quality(derived), "view": view}
+    quality = judge_quality(derived)
+    how = {"source": source, "method": ",".join(part[2] for part in parts)}
+    how |= quality | {"differences": {q: d.tolist() for q, d in differences.items()}}
+    write_columns(root, output, info, table, new, names, {META: meta, DERIVED: how})
+    return {"differences": differences, "quality": quality, "view": view}
 
 
 def _derive(

@@ -10,10 +10,9 @@ from statistics import fmean
 from dynmap_rl.data.derive import add_dynamics
 from dynmap_rl.evaluation.protocol import result_rows
 from dynmap_rl.evaluation.statistics import shared_interval, summarize
-from dynmap_rl.utils.files import read_json, write_json
+from dynmap_rl.utils.files import read_json
 
 from .cells import Run
-from .sources import quality_file
 from .tables import cause_table, commits_text, join_table
 
 TASKS = "FetchPush", "FetchSlide", "PlateSlide", "Soccer"
@@ -119,10 +118,9 @@ def derived_columns(task: str, method: str) -> dict | None:
 
 
 def derive_dataset(task: str, recording: Path, method: str, folder: Path) -> None:
-    """Derive a dataset from a recording if it is missing; ``NAME.quality.json`` beside it has its quality."""
+    """Derive a dataset from a recording if it is missing."""
     if not folder.exists():
-        found = add_dynamics(recording, folder, **derived_columns(task, method), replace=True)
-        write_json(quality_file(folder), found["quality"])
+        add_dynamics(recording, folder, **derived_columns(task, method), replace=True)
 
 
 def read_benchmarks(results: Path) -> dict[tuple[str, str], list[dict]]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
+from dynmap_rl.data.demonstrations import DERIVED
 from dynmap_rl.data.derive import add_dynamics
 from dynmap_rl.data.recording.record import record_dataset
 from dynmap_rl.envs.tasks import get_task
@@ -166,7 +167,7 @@ def make_datasets(cells: list[Run], datasets: Path, workers: int = 1) -> None:
 
     Args:
         cells: cells of :func:`list_source_cells` and :func:`list_data_cells`.
-        datasets: folder of the derived datasets; ``NAME.quality.json`` beside each has its quality.
+        datasets: folder of the derived datasets.
         workers: processes that record.
     """
     wanted = {cell.arguments[cell.arguments.index("--dataset") + 1]: cell.task for cell in cells}
@@ -183,22 +184,14 @@ def make_datasets(cells: list[Run], datasets: Path, workers: int = 1) -> None:
                     record_dataset(recording, task, episodes=size, workers=workers)
                 if source.columns is not None and not folder.exists():
                     print(f"deriving {folder}", flush=True)
-                    found = add_dynamics(recording, folder, **source.columns, replace=True)
-                    differences = {q: d.tolist() for q, d in found["differences"].items()}
-                    quality = found["quality"] | {"differences": differences}
-                    write_json(quality_file(folder), quality)
+                    add_dynamics(recording, folder, **source.columns, replace=True)
 
 
 def copy_quality(cells: list[Run], results: Path) -> None:
     """Copy the quality of the cells' derived datasets to ``quality/DATASET.json`` in the folder of the results."""
     for folder in {Path(cell.dataset) for cell in cells if cell.dataset}:
-        if (judged := quality_file(folder)).exists():
+        if (judged := folder / DERIVED).exists():
             write_json(results / "quality" / f"{folder.name}.json", read_json(judged))
-
-
-def quality_file(dataset: Path) -> Path:
-    """Return the file beside a derived dataset that has the quality of its columns."""
-    return dataset.with_name(f"{dataset.name}.quality.json")
 
 
 def _cell(

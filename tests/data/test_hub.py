@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from dynmap_rl.data.demonstrations import load_dataset
-from dynmap_rl.data.format.hub import draw_episodes
+from dynmap_rl.data.demonstrations import load_dataset, load_meta
+from dynmap_rl.data.format.hub import _describe, draw_episodes
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "collect.py"
 ONLINE = f"""
@@ -172,6 +172,14 @@ def test_a_run_folder_goes_there_and_back_and_is_found_offline(hub, run):
 def test_without_a_network_there_is_one_clear_error(recording, tmp_path, run):
     shutil.copytree(recording, tmp_path / "dataset")
     run(NO_NETWORK, "http://127.0.0.1:9")  # nobody listens
+
+
+def test_the_card_says_where_the_dynamics_are_from(recording):
+    derived = {"source": "flow", "method": "savgol", "verdict": "doubtful"}
+    cards = [_describe(load_meta(recording), "Carry the block.", how) for how in (None, derived)]
+    command = "add_dynamics.py --source flow --method savgol"
+    assert [command in card for card in cards] == [False, True]
+    assert ["simulator's" in card for card in cards] == [True, False]
 
 
 def test_the_picture_shows_frames(recording, tmp_path):

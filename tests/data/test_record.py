@@ -11,6 +11,7 @@ import pytest
 from filelock import FileLock
 
 from dynmap_rl.data.demonstrations import FORMAT, META, load_dataset, load_meta
+from dynmap_rl.data.derive import add_dynamics
 from dynmap_rl.data.recording import record as module
 from dynmap_rl.data.recording.record import record_dataset
 from dynmap_rl.utils.files import write_json
@@ -139,6 +140,14 @@ def test_a_folder_with_something_else_is_refused(tmp_path):
         record_dataset(tmp_path)
     with pytest.raises(OSError, match="may the folder be written"):
         record_dataset(tmp_path / "thesis.tex" / "dataset")
+
+
+def test_a_recording_with_derived_dynamics_is_not_taken_for_the_simulators(recording, tmp_path):
+    add_dynamics(recording, tmp_path / "derived", replace=True, columns=range(3))
+    settings = {"episodes": 4, "eval_episodes": 2}
+    assert record_dataset(recording, **settings) == recording
+    with pytest.raises(ValueError, match="derived dynamics"):
+        record_dataset(tmp_path / "derived", **settings)
 
 
 @pytest.mark.parametrize(

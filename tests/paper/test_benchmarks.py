@@ -88,7 +88,7 @@ def test_dynamics_of_the_hand_are_its_recorded_positions(tmp_path):
     record_dataset(tmp_path / "plate_slide", "mujoco:PlateSlide", episodes=1, eval_episodes=1, workers=1)
     for _ in range(2):  # the second time, it is there
         derive_dataset("PlateSlide", tmp_path / "plate_slide", "RGB+[P+V] of the hand", tmp_path / "hand")
-    assert read_json(tmp_path / "hand.quality.json")["verdict"] in ("good", "doubtful")
+    assert read_json(tmp_path / "hand/meta/dynamics.json")["verdict"] in ("good", "doubtful")
     hand, full = (load_dataset(tmp_path / name, "train") for name in ("hand", "plate_slide"))
     assert hand["dynamics", "position"].shape == (1, 80, 3)
     torch.testing.assert_close(hand["dynamics", "position"], full["dynamics", "position"][..., -3:])

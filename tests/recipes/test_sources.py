@@ -66,7 +66,7 @@ def test_every_source_has_three_world_models_and_two_policies(tmp_path):
 def test_cells_run_once_and_make_a_page(calls, tmp_path):
     checks = {"jumps": {"good": True}, "residual": {"good": False}}
     judged = {"verdict": "doubtful", "checks": checks}
-    write_json(tmp_path / f"datasets/sources/{TASK}_tracks.quality.json", judged)
+    write_json(tmp_path / f"datasets/sources/{TASK}_tracks/meta/dynamics.json", judged)
     result = run(tmp_path, "--only", "tracks,none,simulator,end_to_end")
     assert result.returncode == 0, result.stderr
     recipes = [recipe for recipe, _ in calls]
@@ -137,10 +137,8 @@ def test_real_cells(recordings, tmp_path):
     assert len(results) == 8 and all(r["test_protocol"]["episodes"] == 3 for r in results.values())
     measured = [json.loads(p.read_text()) for p in (tmp_path / "results/measures").glob("*.json")]
     assert len(measured) == 4 and all(m["open_loop_mm"] > 0 for m in measured)
-    assert read_json(tmp_path / f"datasets/sources/{TASK}_tracks.quality.json")["verdict"] in (
-        "good",
-        "doubtful",
-    )
+    derived = read_json(tmp_path / f"datasets/sources/{TASK}_tracks/meta/dynamics.json")
+    assert derived["verdict"] in ("good", "doubtful")
 
 
 @pytest.mark.parametrize(

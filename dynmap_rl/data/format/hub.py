@@ -9,9 +9,10 @@ import numpy as np
 from tensordict import TensorDict
 
 from dynmap_rl.envs.world import CONTROL_DT, EPISODE_STEPS
+from dynmap_rl.utils.files import read_json
 from dynmap_rl.utils.hub import first_line
 
-from ..demonstrations import META, load_dataset, load_meta
+from ..demonstrations import DERIVED, META, load_dataset, load_meta
 from .quiet import quiet
 
 PICTURE = "picture.png"
@@ -43,10 +44,19 @@ How it was made: PyMunk simulates, pygame draws, {maker}. The command was
 | `expert_action` | 3 | what the expert would have done, without noise and pushes: to be imitated |
 | `disturbed` | 1 | a push acted in this step in the place of the expert |
 | `dynamics.position` | 6 | cart x, y, theta, block x, y, theta (m, m, rad) |
-| `dynamics.velocity` | 6 | its rate, as the simulator has it (m/s, rad/s) |
-| `dynamics.acceleration` | 6 | change of velocity since the last step over {dt} s (m/s^2, rad/s^2); 0 at the start |
+| `dynamics.velocity` | 6 | its rate (m/s, rad/s) |
+| `dynamics.acceleration` | 6 | change of the velocity (m/s^2, rad/s^2) |
+
+{origin}
 
 `{meta}` holds the splits ({splits}), constants of normalisation, and scene, seed and expert of every episode."""
+
+SIMULATED = f"""\
+The dynamics are the simulator's. The acceleration is the change of the velocity since the last step over {CONTROL_DT} s, and
+0 at the start."""
+DERIVATION = """\
+The dynamics were derived with `python recipes/add_dynamics.py --source {source} --method {method}`, and are {verdict} by the
+checks in `meta/dynamics.json`."""
 
 
 def push_dataset(root: str | Path, repo_id: str) -> None:
@@ -85,7 +95,7 @@ def push_dataset(root: str | Path, repo_id: str) -> None:
             dataset.push_to_hub(
                 tags=["dynamics", "world-model", "imitation-learning"],
                 license="mit",
-                dataset_description=_describe(meta, instruction=dataset.meta.tasks.index[0]),
+                dataset_description=_describe(meta, dataset.meta.tasks.index[0], _read_derivation(root)),
                 paper=PAPER,
                 url="https://github.com/Automation-Research-Team/DynamicsMapping-2D (the paper's)",
                 citation_bibtex=CITATION,
@@ -120,7 +130,12 @@ def draw_episodes(episodes: TensorDict, path: Path, rows: int = 3, columns: int 
 KINDS = {"human": "Demonstrations of a person", "undisturbed": "Undisturbed demonstrations"}
 
 
-def _describe(meta: dict, instruction: str) -> str:
+def _read_derivation(root: str | Path) -> dict | None:
+    path = Path(root) / DERIVED
+    return read_json(path) if path.exists() else None
+
+
+def _describe(meta: dict, instruction: str, derived: dict | None) -> str:
     splits, task, kind = meta["splits"], meta["task"], meta["kind"]
     train, test = (end - first for first, end in (splits["train"], splits["eval"]))
     collect = f"collect.py --task {task} --kind {kind} --episodes {train} --eval_episodes {test}"
@@ -147,7 +162,7 @@ def _describe(meta: dict, instruction: str) -> str:
         picture=PICTURE,
         maker=maker,
         command=command,
-        dt=CONTROL_DT,
+        origin=DERIVATION.format(**derived) if derived else SIMULATED,
         meta=META,
         splits=", ".join(f"{name} {first} to {end - 1}" for name, (first, end) in splits.items()),
     )

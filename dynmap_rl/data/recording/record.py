@@ -17,7 +17,7 @@ from dynmap_rl.utils.cluster import check_launcher, run_by_ray
 from dynmap_rl.utils.files import read_json, write_json
 from dynmap_rl.utils.processes import open_pool, share
 
-from ..demonstrations import FORMAT, META, load_meta
+from ..demonstrations import DERIVED, FORMAT, META, load_meta
 from .plans import find_checkpoints
 from .shards import Shard, merge_shards, record_shard
 
@@ -108,6 +108,10 @@ def _check_settings(root: Path, settings: dict) -> None:
 
 def _stored_settings(root: Path) -> dict | None:
     """Return the settings of the recording in a folder, complete or not; None where there is none."""
+    if (root / DERIVED).exists():
+        raise ValueError(
+            f"{root} must be a recording or a new folder, got a dataset with derived dynamics; choose another folder"
+        )
     if (root / META).exists():
         meta = load_meta(root)
         sizes = {name: end - first for name, (first, end) in meta["splits"].items()}

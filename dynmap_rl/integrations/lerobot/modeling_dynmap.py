@@ -23,6 +23,7 @@ from dynmap_rl.objectives.world_model import WorldModelLoss
 from .columns import find_constants, find_task, is_symmetric, read_columns
 from .configuration_dynmap import GOAL, DynmapConfig
 
+
 class DynmapPolicy(PreTrainedPolicy):
     """World model, and the policy that acts on its states.
 
