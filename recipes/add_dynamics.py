@@ -88,6 +88,10 @@ def main(config: Config) -> None:
     unused = {"state": of_frames, "tracks": of_state, "flow": of_state}
     unused["centroid"] = *of_state, "objects", "colors", "sort", "point"
     refuse(config, Config(), unused.get(config.source, ()), f"--source {config.source}")
+    if (config.method or config.source) in ("central", "state"):
+        refuse(config, Config(), ("window", "order"), "--method central")
+    if not config.angles:
+        refuse(config, Config(), ("period", "angle_noise"), "no --angles")
     settings = vars(config) | {
         "columns": parse_entries(config.columns, "--columns"),
         "angles": parse_entries(config.angles, "--angles") or [],

@@ -70,11 +70,11 @@ def load_robot_dataset(
     """Load training and held-out pieces of any LeRobot v3.0 dataset, with constants of normalisation.
 
     Frames are resized to S x S with ``cv2.INTER_AREA``, whatever their aspect; those of several cameras stand side by
-    side. Episodes shorter than ``min_steps``
-    are left out. The others are cut into pieces of T steps, T being the length of the shortest episode, at most 120.
-    As many pieces as needed cover an episode, evenly spread; they overlap where T does not divide its length. No piece
-    crosses the border of an episode. Splits named ``train`` and ``eval`` are kept; otherwise every tenth episode is
-    held out, or the last one of fewer than ten. All pieces of an episode are in one split.
+    side. Episodes shorter than ``min_steps`` are left out. The others are cut into pieces of T steps, T being the length of
+    the shortest episode, at most 120, or ``min_steps`` if that is more. As many pieces as needed cover an episode, evenly
+    spread; they overlap where T does not divide its length. No piece crosses the border of an episode. Splits named
+    ``train`` and ``eval`` are kept; otherwise every tenth episode is held out, or the last one of fewer than ten. All
+    pieces of an episode are in one split.
 
     Args:
         dataset: local folder or hub id.
@@ -98,7 +98,7 @@ def load_robot_dataset(
     numbers, rows = _read_numbers(layout)
     lengths = {e: r.stop - r.start for e, r in rows.items() if r.stop - r.start >= min_steps}
     splits = choose_splits(root, info, list(lengths))
-    steps = min(LONGEST, *lengths.values())
+    steps = min(max(LONGEST, min_steps), *lengths.values())
     parts = {name: [] for name in splits}
     size = image_size, image_size
     sources = [iterate_frames(root, info, name, size=size) for name in layout["cameras"]]

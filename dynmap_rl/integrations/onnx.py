@@ -23,7 +23,7 @@ def export_to_onnx(run: str | Path, folder: str | Path, seed: int = 0) -> Path:
     ==================== ============================================= ===================================
     file                 inputs                                        outputs
     ==================== ============================================= ===================================
-    ``encoder.onnx``     ``pixels`` uint8 ``[B, 3, 64, 64]``           ``latent`` ``[B, Z]``
+    ``encoder.onnx``     ``pixels`` uint8 ``[B, 3, S, cameras * S]``   ``latent`` ``[B, Z]``
     ``transition.onnx``  ``latent``, ``action`` ``[B, A]``,            ``predicted_latent``,
                          ``hidden1``, ``cell1``, ``hidden2``,          ``next_hidden1``, and so on
                          ``cell2`` ``[B, H]``
@@ -53,7 +53,8 @@ def export_to_onnx(run: str | Path, folder: str | Path, seed: int = 0) -> Path:
     actor, folder, batch = load_actor(run, seed).eval(), Path(folder), torch.export.Dim("batch")
     folder.mkdir(parents=True, exist_ok=True)
     for part, (function, sizes, outputs) in _list_parts(actor).items():
-        pixels = torch.zeros(2, 3, 64, 64, dtype=torch.uint8)
+        size, cameras = actor.world_model.image_size, actor.world_model.cameras
+        pixels = torch.zeros(2, 3, size, cameras * size, dtype=torch.uint8)
         inputs = tuple(pixels if size is None else torch.zeros(2, size) for size in sizes.values())
         with warnings.catch_warnings(), torch.no_grad():
             warnings.simplefilter("ignore")
@@ -158,7 +159,7 @@ class OnnxActor:
         """Return the actions ``[B, A]`` of this step.
 
         Args:
-            pixels: frames uint8 ``[B, 3, 64, 64]``.
+            pixels: frames uint8 ``[B, 3, S, cameras * S]``.
             goal: goals ``[B, G]`` (SI units).
         """
         values = self._memory | {"pixels": pixels, "goal": goal.astype(np.float32)}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import torch
 from torch import nn
@@ -32,8 +32,15 @@ class CameraEncoders(nn.Module):
         shape = 3, self.image_size, self.image_size * len(self.encoders)
         if pixels.shape[-3:] != shape:
             raise ValueError(f"pixels must be [..., {', '.join(map(str, shape))}], got {list(pixels.shape)}")
+        return self._add(self.encoders, pixels)
+
+    def encode(self, x: torch.Tensor) -> torch.Tensor:
+        """Encode frames ``[N, 3, S, cameras * S]`` in 0..255 as latents ``[N, Z]``, without cutting N into parts."""
+        return self._add([encoder.encode for encoder in self.encoders], x)
+
+    def _add(self, encoders: Iterable[Callable], pixels: torch.Tensor) -> torch.Tensor:
         frames = pixels.split(self.image_size, -1)
-        latents = [encode(frame) for encode, frame in zip(self.encoders, frames, strict=True)]
+        latents = [encode(frame) for encode, frame in zip(encoders, frames, strict=True)]
         step = latents[0].shape[-1] // len(latents)
         return sum(latent.roll(i * step, -1) for i, latent in enumerate(latents))
 

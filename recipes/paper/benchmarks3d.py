@@ -55,6 +55,7 @@ def main(config: Config) -> None:
     from dynmap_rl.paper.benchmarks import derive_dataset, list_benchmarks
     from dynmap_rl.paper.launch import execute, is_done, launch, print_runs
     from dynmap_rl.paper.sources import copy_quality
+    from dynmap_rl.utils.files import read_json
 
     if config.write:
         return write(config)
@@ -62,6 +63,11 @@ def main(config: Config) -> None:
     if not cells:
         raise ValueError(f"--only must be a part of a cell's name, got {config.only!r}; see --dry_run")
     todo = [cell for cell in cells if not is_done(cell.name, config.results)]
+    for path in (config.results / f"{cell.name}.json" for cell in cells if cell not in todo):
+        if (scenes := read_json(path)["test_protocol"]["episodes"]) != config.episodes:
+            raise ValueError(
+                f"{path} has {scenes} --episodes instead of {config.episodes}; choose another --results"
+            )
     if config.dry_run:
         return print_runs(cells, todo)
     from dynmap_rl.training.dataset import find_or_record

@@ -85,6 +85,7 @@ def test_episodes_that_are_too_short_are_left_out_and_long_ones_cut(tmp_path):
     root = make_robot_dataset(tmp_path / "lengths", (130, 8, 125))
     splits, _ = load_robot_dataset(root, 20)
     assert splits["train"].shape == (2, 120)
+    assert load_robot_dataset(root, 122)[0]["train"].shape == (2, 122)
     with pytest.raises(ValueError, match="lengths must"):
         load_robot_dataset(root, 128)
 

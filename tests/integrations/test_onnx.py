@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 import torch
-from small import CONSTANTS, make_model
+from small import CONSTANTS
 from tensordict import TensorDict
 
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.evaluation.rollout import scene_seeds
 from dynmap_rl.integrations.onnx import PARTS, OnnxActor, export_to_onnx
-from dynmap_rl.modules.checkpoints import make_policy, save_policy, save_world_model
+from dynmap_rl.modules.checkpoints import make_policy, make_world_model, save_policy, save_world_model
 from dynmap_rl.runs.lookup import load_actor
 
 REASON = "needs the extra onnx: pip install 'dynmap_rl[onnx]'"
@@ -79,9 +79,11 @@ def test_a_reset_and_any_batch_size(exported):
 
 
 @pytest.mark.slow
-def test_a_feedforward_policy_has_no_memory(packages, tmp_path):
+@pytest.mark.parametrize(("architecture", "size", "cameras"), [("glimpse", 64, 1), ("plain", 96, 2)])
+def test_a_feedforward_policy_has_no_memory(packages, tmp_path, architecture, size, cameras):
     torch.manual_seed(0)
-    world_model = make_model()
+    form = {"architecture": architecture, "image_size": size, "cameras": cameras}
+    world_model = make_world_model(CONSTANTS, ("position",), 16, 24, **form)
     save_world_model(tmp_path / "run/world_model", world_model)
     policy = make_policy(CONSTANTS, "feedforward", world_model)
     save_policy(tmp_path / "run/seed_0/policy", policy, world_model)
@@ -90,7 +92,7 @@ def test_a_feedforward_policy_has_no_memory(packages, tmp_path):
     actor.mixed = False
     act = in_pytorch(actor)
     for _ in range(4):
-        pixels = torch.randint(256, (2, 3, 64, 64), dtype=torch.uint8)
+        pixels = torch.randint(256, (2, 3, size, cameras * size), dtype=torch.uint8)
         goal = torch.rand(2, 2)
         with torch.no_grad():
             expected = act(pixels, goal).numpy()

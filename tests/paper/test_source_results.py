@@ -32,7 +32,9 @@ def test_a_world_model_without_supervision_is_measured_like_any_other(short):
 def linear_episodes(model, count):
     """Return episodes whose position at t is a linear map of what the model predicts for t from the frames before."""
     episodes = make_episodes(count)["train"].clone()
-    states = torch.cat(model.predict(model.encode(episodes["pixels"], mixed=True).float(), episodes["action"]), -1)
+    states = torch.cat(
+        model.predict(model.encode(episodes["pixels"], mixed=True).float(), episodes["action"]), -1
+    )
     weights = torch.randn(states.shape[-1], 6, generator=torch.Generator().manual_seed(0))
     return episodes.set(("dynamics", "position"), 0.1 * states @ weights)
 

@@ -302,6 +302,12 @@ def test_state_and_tracks_stand_side_by_side_and_are_judged_together(videos, tmp
         ({"source": "tracks", "noise": 0.1}, "--noise has no effect"),
         ({"source": "tracks", "width": -1.0}, "--width"),
         ({"noise": -1.0}, "--noise"),
+        ({"window": 21}, "--window has no effect with --method central"),
+        (
+            {"source": "tracks", "method": "central", "order": 4},
+            "--order has no effect with --method central",
+        ),
+        ({"period": 360.0}, "--period has no effect with no --angles"),
     ],
 )
 def test_bad_input_is_refused_before_anything_is_written(images, tmp_path, settings, message):

@@ -4,7 +4,7 @@ import pytest
 from commands import PRESETS, run
 from own_task import check_renderer
 
-from dynmap_rl.utils.files import read_json
+from dynmap_rl.utils.files import read_json, write_json
 
 
 def test_the_cells_are_listed_without_work(tmp_path):
@@ -26,6 +26,14 @@ def test_the_cells_are_listed_without_work(tmp_path):
 def test_wrong_options_are_refused(tmp_path, recipe, arguments, message):
     result = run(tmp_path, recipe, *arguments)
     assert result.returncode in (1, 2) and message in result.stderr, result.stderr
+
+
+def test_results_of_other_scenes_are_not_mixed(tmp_path):
+    write_json(tmp_path / "found/soccer_act_seed_1.json", {"test_protocol": {"episodes": 500}})
+    grid = "benchmarks3d", "--dry_run", "--results", "found", "--only", "soccer_act"
+    assert "1 of 3 runs" in run(tmp_path, *grid).stdout
+    refused = run(tmp_path, *grid, "--episodes", "20")
+    assert refused.returncode == 2 and "500 --episodes instead of 20" in refused.stderr
 
 
 @pytest.mark.slow
