@@ -63,6 +63,7 @@ def main(config: Config) -> None:
     from dynmap_rl.reporting.run_page import row_text, write_report
     from dynmap_rl.runs.folder import open_run, plain_settings
     from dynmap_rl.runs.loggers import check_logger
+    from dynmap_rl.training.dagger import check_corrections
     from dynmap_rl.training.dataset import check_dataset, choose_augmentation, find_or_record
     from dynmap_rl.training.decoupled import check_same, train_policies
     from dynmap_rl.training.world_model import build_world_model, train_world_model
@@ -74,6 +75,7 @@ def main(config: Config) -> None:
     task, seeds = get_task(config.task), parse_seeds(config.seeds)
     device = choose_device(config.compute.device)
     check_logger(config.logger)
+    check_corrections(config.policy, config.task)
     if config.dataset:
         check_dataset(config.dataset, config.task)
     world_model = load_pretrained(config) if config.pretrained else None

@@ -9,8 +9,7 @@
 
 A policy acts on frames in closed loop; the result is drop rate, position error, success rate, and the number of failures
 by cause. An expert acts on states; the result is the rates of success, drops and touches, and for task 2 how often the
-straight path to the goal is blocked, and the shortest one leads around it. Rates have 95 % Wilson intervals. runs/evaluate
-gets numbers and a page.
+straight path to the goal is blocked. Rates have 95 % Wilson intervals. runs/evaluate gets numbers and a page.
 """
 
 import sys
@@ -156,6 +155,7 @@ def load_policy(config: Config, folder: Path, instruction: str):
         raise ValueError(
             f"--policy must be a run, got {config.policy}; LeRobot policies need pip install '.[lerobot]' ({error})"
         ) from error
+    refuse(config, Config(), ["seed"], "a LeRobot policy")
     return LeRobotActor(config.policy, instruction=instruction)
 
 
@@ -177,6 +177,7 @@ def judge_expert(config: Config) -> tuple[Path, str, dict]:
         outcomes, draw = judge_demonstrator(task, seeds), partial(film_demonstrator, config.task)
     else:
         if expert == "careless":
+            refuse(config, Config(), ["checkpoint"], "--expert careless")
             checkpoint, network, trained_on = "baseline", CarelessController(task), task
         else:
             checkpoint = config.checkpoint or list_checkpoints(expert)[-1]

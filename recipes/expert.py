@@ -7,7 +7,7 @@ resumes a stopped run. To ship checkpoints with the package, copy them to ``dynm
 """
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -47,7 +47,7 @@ def main(config: Config) -> None:
     from dynmap_rl.experts.network import ExpertNetwork, list_checkpoints, roll_out
     from dynmap_rl.reporting.html import write_html
     from dynmap_rl.reporting.media import film
-    from dynmap_rl.runs.folder import open_run
+    from dynmap_rl.runs.folder import open_run, plain_settings
     from dynmap_rl.runs.loggers import check_logger
     from dynmap_rl.training.ppo import train_ppo
     from dynmap_rl.utils.devices import seed_everything
@@ -62,10 +62,9 @@ def main(config: Config) -> None:
     torch.set_num_threads(1)  # these networks are too small for more
     task = get_task(config.task, kind=Task)
     make_env = partial(DynmapBatchedEnv, config.task, control="acceleration")
-    # A run may resume with more iterations.
-    comparable = replace(config, ppo=replace(ppo, iterations=PPOTraining().iterations))
     folder = config.run or Path("runs/expert") / task.name
-    open_run(folder, comparable, ignore=("run", "threads", "logger"))
+    # A run may resume with more iterations.
+    open_run(folder, config, ignore=("run", "threads", "logger", "ppo.iterations"))
     seed_everything(ppo.seed)
     limit = config.acceleration * ACCELERATION_LIMIT
     network = ExpertNetwork(task.state_size, tuple(limit))
@@ -85,7 +84,8 @@ def main(config: Config) -> None:
     seeds = fresh_scenes(ppo.eval_episodes)
     success = [task.is_success(world) for world in roll_out(network, task, seeds)]
     film(network, task, failures_first(seeds, success), folder / "rollouts.gif")
-    write_html(folder, f"Expert, {task.name}", rates_text(last), command_line(sys.argv))
+    settings = plain_settings(config)
+    write_html(folder, f"Expert, {task.name}", rates_text(last), command_line(sys.argv), settings)
     print(f"{rates_text(last)}\nwritten: {folder}")
 
 

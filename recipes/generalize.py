@@ -58,6 +58,7 @@ def main(config: Config) -> None:
     from dynmap_rl.runs.folder import open_run, plain_settings
     from dynmap_rl.runs.loggers import check_logger
     from dynmap_rl.runs.lookup import load_source
+    from dynmap_rl.training.dagger import check_corrections
     from dynmap_rl.training.dataset import check_dataset, find_or_record
     from dynmap_rl.training.decoupled import check_same, train_policies
     from dynmap_rl.utils.devices import choose_device
@@ -66,6 +67,7 @@ def main(config: Config) -> None:
     task, seeds = get_task(config.task, kind=Task), parse_seeds(config.seeds)
     choose_device(config.compute.device)
     check_logger(config.logger)
+    check_corrections(config.policy, config.task)
     if config.dataset:
         check_dataset(config.dataset, config.task)
     world_model, source = load_source(config.pretrained)

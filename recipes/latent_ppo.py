@@ -49,9 +49,10 @@ def main(config: Config) -> None:
     from dynmap_rl.evaluation.rollout import failures_first
     from dynmap_rl.experts import network as experts
     from dynmap_rl.reporting.html import write_html
-    from dynmap_rl.runs.folder import open_run
+    from dynmap_rl.runs.folder import open_run, plain_settings
     from dynmap_rl.runs.loggers import check_logger
     from dynmap_rl.runs.lookup import load_source
+    from dynmap_rl.training.decoupled import check_same
     from dynmap_rl.training.ppo import train_ppo
     from dynmap_rl.utils.devices import seed_everything
     from dynmap_rl.utils.files import read_json, write_json
@@ -70,13 +71,16 @@ def main(config: Config) -> None:
     states_of = experts.task_of_expert(config.expert or config.task, task)
     folder = config.run or Path("runs/latent_ppo") / task.name
     open_run(folder, config, ignore=("run", "threads", "logger"))
+    frozen_weights, begun = fingerprint(world_model), folder / "world_model.json"
+    if not begun.exists():
+        write_json(begun, {"world_model_sha256": frozen_weights})
+    check_same(world_model, read_json(begun), folder)
     if (folder / "eval.json").exists():
         result = read_json(folder / "eval.json")
         print(f"{folder} is complete; delete it to run again\n{result_text(result)}")
         return
     torch.set_num_threads(config.threads)
 
-    frozen_weights = fingerprint(world_model)
     make = partial(make_env, world_model, config.task)
     size = make(1).observation_spec["state"].shape[-1]
     seed_everything(ppo.seed)
@@ -105,7 +109,8 @@ def main(config: Config) -> None:
     seeds = fresh_scenes(ppo.eval_episodes)
     success = [task.is_success(world) for world in roll_out(network, world_model, config.task, seeds)]
     film(network, world_model, config.task, failures_first(seeds, success), folder / "rollouts.gif")
-    write_html(folder, f"PPO on latents, {task.name}", result_text(result), result["command"])
+    settings = plain_settings(config)
+    write_html(folder, f"PPO on latents, {task.name}", result_text(result), result["command"], settings)
     write_json(folder / "eval.json", result)
     print(f"{result_text(result)}\nwritten: {folder}")
 

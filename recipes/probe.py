@@ -49,7 +49,7 @@ def main(config: Config) -> None:
     """Measure, draw and report."""
     from dynmap_rl.data.demonstrations import load_dataset, load_meta
     from dynmap_rl.envs.scene import Scene
-    from dynmap_rl.evaluation.open_loop import open_loop_errors
+    from dynmap_rl.evaluation.open_loop import decodes_poses, open_loop_errors
     from dynmap_rl.evaluation.perception import begin_scenes, color_errors, locate_cart
     from dynmap_rl.evaluation.probing import judge_states, probe
     from dynmap_rl.reporting.figures import plot_open_loop, plot_perception, plot_probes
@@ -60,13 +60,13 @@ def main(config: Config) -> None:
     from dynmap_rl.utils.version import find_commit
 
     models = load_world_models(config.runs.split(","))
-    dataset = config.dataset or find_or_record("balance_reaching")
+    dataset = find_or_record("balance_reaching", config.dataset)
     train = load_dataset(dataset, "train", config.cache)[: config.train_episodes]
     test = load_dataset(dataset, "eval", config.cache)[: config.test_episodes]
     open_loop = {
         name: open_loop_errors(model, test, config.context, config.horizon)
         for name, model in models.items()
-        if "position" in model.supervision
+        if decodes_poses(model)
     }
     probes = {name: probe(model, train, test) for name, model in models.items()}
     rows = [row for row in load_meta(dataset)["episodes"] if row["split"] == "eval"][: len(test)]

@@ -72,6 +72,7 @@ def main(config: Config) -> None:
     from dynmap_rl.reporting.robot_page import robot_row_text, write_robot_report
     from dynmap_rl.runs.folder import open_run, plain_settings
     from dynmap_rl.runs.loggers import check_logger
+    from dynmap_rl.training.dagger import check_corrections
     from dynmap_rl.training.decoupled import train_policies
     from dynmap_rl.training.joint import train_seeds
     from dynmap_rl.training.world_model import build_world_model, train_world_model
@@ -81,6 +82,7 @@ def main(config: Config) -> None:
     check_config(config)
     seeds, device = parse_seeds(config.seeds), choose_device(config.compute.device)
     check_logger(config.logger)
+    check_corrections(config.policy, None)
     supervision = parse_supervision(config.world_model.supervision)
     describe_robot_dataset(config.dataset, config.camera, config.goal, supervision)
     folder = config.run or default_folder(config)

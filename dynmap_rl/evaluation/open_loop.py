@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDictBase
 
 from dynmap_rl.envs.imagination import ImaginationEnv, make_start
+from dynmap_rl.envs.task import BODIES
 from dynmap_rl.modules.world_model import WorldModel
 
 
@@ -18,7 +19,7 @@ def open_loop_errors(
     """Measure the errors of poses that are predicted from actions alone, after some frames.
 
     Args:
-        world_model: world model that decodes positions.
+        world_model: world model that decodes the poses of cart and block (see :func:`decodes_poses`).
         episodes: held-out demonstrations ``[E, T]`` with ``pixels``, ``action`` and ``dynamics``.
         context: frames that are encoded first, at least 1.
         horizon: steps that are predicted after the last of these frames.
@@ -30,10 +31,10 @@ def open_loop_errors(
         numbers, one step ahead first. ``context`` and ``episodes`` repeat the sizes.
 
     Raises:
-        ValueError: the world model decodes no positions, or the episodes are too short.
+        ValueError: the world model does not decode the poses of cart and block, or the episodes are too short.
     """
-    if "position" not in world_model.supervision:
-        raise ValueError("the world model must be supervised on position for open-loop errors")
+    if not decodes_poses(world_model):
+        raise ValueError(f"the world model must be supervised on position, with {len(BODIES)} entries")
     if horizon < 1:
         raise ValueError(f"horizon must be at least 1, got {horizon}")
     if context < 1 or context + horizon > episodes.shape[1]:
@@ -57,6 +58,11 @@ def open_loop_errors(
         columns = (total / len(episodes)).cpu().T.tolist()
         result[name] = dict(zip(("cart_mm", "cart_deg", "block_mm", "block_deg"), columns, strict=True))
     return result
+
+
+def decodes_poses(world_model: WorldModel) -> bool:
+    """Return whether a world model decodes the poses of cart and block."""
+    return world_model.sizes.get("position") == len(BODIES)
 
 
 def _pose_errors(difference: torch.Tensor) -> torch.Tensor:

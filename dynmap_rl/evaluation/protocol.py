@@ -18,7 +18,7 @@ from dynmap_rl.modules.world_model import WorldModel
 from dynmap_rl.utils.processes import map_processes
 
 from .failures import failure_causes
-from .rollout import episode_rows, roll_out, scene_seeds
+from .rollout import episode_rows, find_device, roll_out, scene_seeds
 from .settings import SHARED_STARTS, Evaluation
 from .statistics import summarize
 
@@ -57,7 +57,7 @@ def evaluate(
     seeds = scene_seeds(settings.split, settings.episodes)
     seeds += scene_seeds(settings.split, settings.paper_episodes, start=SHARED_STARTS)
     run = partial(roll_out, task=task, delay=delay, pushed=pushed)
-    if next(actor.parameters()).device.type == "cpu":
+    if find_device(actor).type == "cpu":
         rows = _judge_batches(actor, run, seeds, workers)
     else:
         rows = _judge_batch(lambda: actor, run, seeds, progress=True)

@@ -62,7 +62,7 @@ def roll_out(
         one-step prediction of the actor's world model at t, zero at t = 0, for each quantity that it decodes.
     """
     actor = actor.eval()
-    rules, device = get_task(task), next(actor.parameters()).device
+    rules, device = get_task(task), find_device(actor)
     size = min(len(seeds), rules.max_worlds or len(seeds))
     env = DynmapBatchedEnv(task, size, from_pixels=True, include_state=False, device=device)
     parts, title = [], f"{len(seeds)} episodes" if progress else None
@@ -74,6 +74,11 @@ def roll_out(
             episodes = _roll_out(actor, env, plans, keep_pixels, delay, title)
         parts.append(episodes[: len(some)])
     return torch.cat(parts)
+
+
+def find_device(actor: TensorDictModuleBase) -> torch.device:
+    """Return the device of an actor; the CPU of one without parameters."""
+    return next((parameter.device for parameter in actor.parameters()), torch.device("cpu"))
 
 
 def _roll_out(
@@ -95,8 +100,7 @@ def _roll_out(
     keys = ["action", "goal", *EVENTS, *([pixels] if keep_pixels else [])]
     td = env.reset(scene_seed=torch.tensor(seeds))
     world_model = getattr(actor, "world_model", None)
-    supervision = world_model.supervision if world_model else ()
-    sizes = {q: world_model.dynamics_decoder.normalizers[q].size for q in supervision}
+    sizes = world_model.sizes if world_model else {}
     predicted = {quantity: torch.zeros(count, size, device=device) for quantity, size in sizes.items()}
     pushed, steps = any(plan.pushes for plan in plans), []
     bar = {} if title else {"disable": True}  # False would override TQDM_DISABLE
@@ -125,8 +129,8 @@ def episode_rows(episodes: TensorDict, seeds: list[int]) -> list[dict]:
         seeds: seeds of its scenes.
 
     Returns:
-        Rows with ``scene_seed``, ``dropped``, ``touched`` (the cart touched a wall), ``position_error`` (m) and
-        ``success``. If the world model decodes positions of all bodies, ``localization_error`` is the mean distance between predicted
+        Rows with ``scene_seed``, ``dropped``, ``touched`` (cart or block touched a wall of an obstacle or bin),
+        ``position_error`` (m) and ``success``. If the world model decodes positions of all bodies, ``localization_error`` is the mean distance between predicted
         and true position of the first body, the cart or the object of a MuJoCo task (m), and
         ``localization_error_away`` its mean over the steps more than 0.1 m from the goal.
     """

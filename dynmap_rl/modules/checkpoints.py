@@ -71,7 +71,7 @@ def save_world_model(folder: Path, model: WorldModel) -> None:
     """Write weights and sizes of a world model to a folder."""
     arguments = {
         "action": model.transition.action.size,
-        "dynamics": {q: n.size for q, n in model.dynamics_decoder.normalizers.items()},
+        "dynamics": model.sizes,
         "latent_size": model.latent_size,
         "hidden_size": model.hidden_size,
         "architecture": model.architecture,

@@ -77,6 +77,11 @@ class WorldModel(nn.Module):
         """Quantities that are decoded, in the paper's order."""
         return self.dynamics_decoder.quantities
 
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Numbers of entries D of the quantities that are decoded."""
+        return {name: normalizer.size for name, normalizer in self.dynamics_decoder.normalizers.items()}
+
     def encode(self, pixels: torch.Tensor, mixed: bool = False) -> torch.Tensor:
         """Encode frames ``[..., 3, S, cameras * S]`` as latents ``[..., Z]``: ``z_t = ENC(I_t)``.
 

@@ -33,15 +33,18 @@ def imitation_loss(
         ignore: bool ``[B, T, 1]``, steps to leave out because the demonstrator did not act.
         emphasis: every step is weighted by ``1 + emphasis * |a_t - a_{t-1}|`` (normalised, ``a_{-1} = 0``). The world
             model's memory holds the last action, and copying it has a low loss in most steps; the weight stresses
-            the steps in which the expert changes its action (keyframe-focused imitation, Wen et al. 2021). 0 is the
-            paper's loss.
+            the steps in which the expert changes its action (keyframe-focused imitation, Wen et al. 2021). The step
+            after an ignored one has the weight 1. 0 is the paper's loss.
         total: function of the sum of the weights, by whose result the loss is divided.
     """
     error = ((predicted - action) / normalizer.scale).abs().mean(-1, keepdim=True)
     weight = torch.ones_like(error)
     if emphasis:
         before = F.pad(action[:, :-1], (0, 0, 1, 0))
-        weight = weight + emphasis * ((action - before) / normalizer.scale).abs().mean(-1, keepdim=True)
+        change = ((action - before) / normalizer.scale).abs().mean(-1, keepdim=True)
+        if ignore is not None:
+            change = torch.where(F.pad(ignore[:, :-1], (0, 0, 1, 0)), 0.0, change)
+        weight = weight + emphasis * change
     if ignore is not None:  # not by a product, since ignored entries may be NaN
         error, weight = (torch.where(ignore, 0.0, x) for x in (error, weight))
     return (error * weight).sum() / total(weight.sum()).clamp_min(1)

@@ -34,6 +34,9 @@ class JointLoss(LossModule):
         beta_joint: weight of the policy's loss.
         emphasis: see :func:`imitation_loss`.
         end_to_end: minimise the policy's loss alone (Eq. 3).
+
+    Raises:
+        ValueError: ``world_model_loss`` has ``imagined``: a policy's states are those of the frames.
     """
 
     @dataclass
@@ -58,6 +61,8 @@ class JointLoss(LossModule):
         end_to_end: bool = False,
     ):
         super().__init__()
+        if world_model_loss.imagined:
+            raise ValueError(f"world_model_loss must have imagined = 0, got {world_model_loss.imagined}")
         self.world_model_loss, self.policy = world_model_loss, policy
         self.beta_joint, self.emphasis, self.end_to_end = beta_joint, emphasis, end_to_end
         super().set_keys(**vars(world_model_loss.tensor_keys))

@@ -12,6 +12,7 @@ from torchrl.objectives.common import LossModule
 
 from dynmap_rl.modules.layers import color_weights
 from dynmap_rl.modules.world_model import WorldModel
+from dynmap_rl.utils.ranks import mean_over_ranks, ranks
 
 
 class WorldModelLoss(LossModule):
@@ -146,7 +147,12 @@ class WorldModelLoss(LossModule):
         self, error: torch.Tensor, masks: TensorDictBase, known: torch.Tensor | None = None
     ) -> torch.Tensor:
         """Return the mean of an error ``[B, T]`` over the valid steps that are known; 0 where there is none."""
-        return self._reduce_loss(error, masks, mask=known, reduction="mean")
+        mean = self._reduce_loss(error, masks, mask=known, reduction="mean")
+        if known is None or ranks() == 1 or not torch.is_grad_enabled():
+            return mean
+        # Processes have different numbers of known steps; the mean of their losses is that of the whole batch.
+        count = self._reduce_loss(torch.ones_like(error), masks, mask=known, reduction="sum")
+        return mean * count / mean_over_ranks(count).clamp_min(1 / ranks())
 
     def _latent_error(self, latent, predicted, read) -> torch.Tensor:
         before, target = (latent if read is None else read)[:, :-1], latent[:, 1:]

@@ -193,7 +193,9 @@ class Session:
         frame = world_model.decode_pixels(*states)[0].clamp(0, 1) * 255
         self.prediction = {"pixels": frame.round().byte().permute(1, 2, 0).numpy()}
         values = world_model.decode_dynamics(*states)
-        self.prediction |= {quantity: value[0].numpy() for quantity, value in values.items()}
+        sizes = {quantity: len(names) for quantity, names in self.env.layout.dynamics.items()}
+        # A world model of other dynamics, such as those of a track, has none that could be compared.
+        self.prediction |= {q: v[0].numpy() for q, v in values.items() if v.shape[-1] == sizes[q]}
 
     def _note(self) -> None:
         self.frames.append(self.td["pixels"])

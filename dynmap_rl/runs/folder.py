@@ -26,7 +26,7 @@ def open_run(folder: Path, config, *, ignore: tuple[str, ...] = ()) -> Path:
     Args:
         folder: run folder.
         config: dataclass of settings.
-        ignore: names of settings that may differ from those of the folder.
+        ignore: names of settings that may differ from those of the folder, such as ``run`` or ``ppo.iterations``.
 
     Returns:
         The folder.
@@ -51,7 +51,8 @@ def _open(folder: Path, config, ignore: tuple[str, ...]) -> Path:
         raise ValueError(
             f"{folder} holds a run of another release, which cannot resume here; choose another --run"
         )
-    old, new = (_flatten({k: v for k, v in s.items() if k not in ignore}) for s in (stored, settings))
+    flat = (_flatten(s).items() for s in (stored, settings))
+    old, new = ({k: v for k, v in s if not {k, k.partition(".")[0]} & set(ignore)} for s in flat)
     if changed := sorted(k for k in {*old, *new} if old.get(k) != new.get(k)):
         detail = ", ".join(f"{k}: {old.get(k)} there, {new.get(k)} here" for k in changed)
         raise ValueError(

@@ -20,6 +20,8 @@ from dynmap_rl.experts.network import list_checkpoints, load_expert, task_of_exp
 from dynmap_rl.modules.actor import Actor
 from dynmap_rl.modules.world_model import WorldModel
 
+from .settings import PolicyTraining
+
 FIRST_SCENE = 1_000_000  # far from the scenes of demonstrations
 
 
@@ -59,8 +61,14 @@ def collect_corrections(
     return torch.stack(steps, 1)
 
 
-def check_expert(task: str | None) -> None:
-    """Raise ``ValueError`` if there is no expert that could correct a policy."""
+def check_corrections(settings: PolicyTraining, task: str | None) -> None:
+    """Raise ``ValueError`` if a policy is to be corrected and there is no expert of the task that could."""
+    if not settings.corrections:
+        if settings.correction_updates != PolicyTraining().correction_updates:
+            raise ValueError(
+                "PolicyTraining.correction_updates has no effect without corrections; leave it out"
+            )
+        return
     if task is None:
         raise ValueError("PolicyTraining.corrections need the expert of a task, got no task")
     list_checkpoints(task)

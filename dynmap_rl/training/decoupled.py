@@ -29,7 +29,7 @@ from dynmap_rl.utils.files import check_space, read_json, write_json
 from dynmap_rl.utils.processes import run_processes
 from dynmap_rl.utils.weights import fingerprint
 
-from .dagger import add_corrections, check_expert
+from .dagger import add_corrections, check_corrections
 from .policy import train_policy
 from .settings import PolicyTraining
 
@@ -82,8 +82,7 @@ def train_policies(
         OSError: a process died, or the disk is full.
     """
     settings, compute, folder = settings or PolicyTraining(), compute or Compute(), Path(folder)
-    if settings.corrections:
-        check_expert(task)
+    check_corrections(settings, task)
     world_model.eval().requires_grad_(False)
     frozen = fingerprint(world_model)
     save_world_model(folder / "world_model", world_model)

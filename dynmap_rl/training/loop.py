@@ -58,6 +58,12 @@ def fit(
             training state is kept.
         OSError: another process has ended.
     """
+    for update in (0, settings.updates - 1):
+        batch, length = windows_at(settings, update)
+        if batch % ranks():
+            raise ValueError(
+                f"windows of a batch must be a multiple of {ranks()} processes, got {batch} of {length} steps"
+            )
     folder = Path(folder)
     device = next(model.parameters()).device
     model.to(memory_format=torch.channels_last)  # with bfloat16 six times faster on a CPU
@@ -79,15 +85,14 @@ def fit(
         _restore(generator, state["generator"], start)
     if not rank():
         truncate_metrics(folder, start)
-    loss_module = share_gradients(loss_module, some=type(settings) is EndToEndTraining)
+    unused = type(settings) is EndToEndTraining or not getattr(settings, "beta_rgb", 1)  # decoders
+    loss_module = share_gradients(loss_module, some=unused)
     part = slice(rank(), None, ranks())
     bar = {"initial": start} | ({"disable": True} if rank() else {})  # False would override TQDM_DISABLE
     progress = tqdm(range(start, settings.updates), folder.name, settings.updates, **bar)
     for update in progress:
         set_learning_rate(optimizer, settings.learning_rate, update, settings.updates)
         batch, length = windows_at(settings, update)
-        if batch % ranks():
-            raise ValueError(f"windows of a batch must be a multiple of {ranks()} processes, got {batch}")
         windows = sample_windows(episodes, batch, length, generator, part).to(device)
         if own is not generator:
             own.manual_seed((1000 * seed + update) * ranks() + rank())

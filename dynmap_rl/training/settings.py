@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from dynmap_rl.data.settings import Augmentation
 from dynmap_rl.keys import DYNAMICS
-from dynmap_rl.utils.settings import check_at_least, check_choice
+from dynmap_rl.utils.settings import check_at_least, check_choice, check_share
 
 SHORT = 4  # steps of a short window
 
@@ -75,14 +75,15 @@ class WorldModelTraining(WorldModelArchitecture):
         super().__post_init__()
         check_at_least(self, 1, "updates", "windows", "rgb_frames")
         check_at_least(self, 2, "window_steps")
-        check_at_least(
-            self, 0, "short_windows", "imagined", "learning_rate", "rarity", "beta_z", "beta_dynamics"
-        )
-        check_at_least(self, 0, "beta_rgb")
-        if not 0 < self.labelled <= 1:
+        check_at_least(self, 0, "learning_rate", "rarity", "beta_rgb", "beta_z", "beta_dynamics")
+        check_share(self, "short_windows", "imagined", "labelled")
+        if not self.labelled:
             raise ValueError(
-                f"{type(self).__name__}.labelled must be above 0 and at most 1, got {self.labelled}; supervision none "
-                "uses no dynamics"
+                f"{type(self).__name__}.labelled must be above 0, got 0; supervision none uses no dynamics"
+            )
+        if self.labelled < 1 and self.supervision == "none":
+            raise ValueError(
+                f"{type(self).__name__}.labelled has no effect with supervision none; leave it out"
             )
         if not self.beta_rgb and self.supervision == "none":
             raise ValueError(
@@ -148,7 +149,8 @@ class EndToEndTraining:
     def __post_init__(self):
         check_at_least(self, 1, "updates", "windows")
         check_at_least(self, 2, "window_steps")
-        check_at_least(self, 0, "short_windows", "learning_rate", "emphasis")
+        check_at_least(self, 0, "learning_rate", "emphasis")
+        check_share(self, "short_windows")
 
 
 @dataclass(frozen=True)
@@ -216,4 +218,5 @@ class PPOTraining:
     def __post_init__(self):
         names = "num_envs", "steps", "iterations", "epochs", "minibatch", "checkpoint_every"
         check_at_least(self, 1, *names, "eval_episodes", "final_episodes")
-        check_at_least(self, 0, "learning_rate", "gamma", "gae_lambda", "clip", "entropy")
+        check_at_least(self, 0, "learning_rate", "clip", "entropy")
+        check_share(self, "gamma", "gae_lambda")

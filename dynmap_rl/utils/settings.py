@@ -12,6 +12,13 @@ def check_at_least(settings, low: float, *names: str) -> None:
             raise ValueError(f"{type(settings).__name__}.{name} must be at least {low}, got {value}")
 
 
+def check_share(settings, *names: str) -> None:
+    """Raise ``ValueError`` for a field that is not within 0 and 1."""
+    for name in names:
+        if not 0 <= (value := getattr(settings, name)) <= 1:
+            raise ValueError(f"{type(settings).__name__}.{name} must be 0 to 1, got {value}")
+
+
 def check_choice(settings, name: str, choices: Sequence[str]) -> None:
     """Raise ``ValueError`` for a field that is none of the choices."""
     if (value := getattr(settings, name)) not in choices:

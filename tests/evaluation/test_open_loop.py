@@ -24,7 +24,7 @@ def make_model(supervision=("position", "velocity")):
 class Perfect(torch.nn.Module):
     """Knows the scene: latents are true positions of the cart, which follows its actions, and of a resting block."""
 
-    supervision, latent_size = ("position",), 6
+    supervision, latent_size, sizes = ("position",), 6, {"position": 6}
 
     def __init__(self, position: torch.Tensor):
         super().__init__()
@@ -71,7 +71,9 @@ def test_open_loop_errors_on_demonstrations(recording):
     together = open_loop_errors(make_model(), episodes, context=3, horizon=4)
     assert errors["model"]["cart_mm"] == pytest.approx(together["model"]["cart_mm"], rel=1e-3)
     assert all(len(column) == 4 for name in ("model", "still") for column in errors[name].values())
-    with pytest.raises(ValueError, match="position"):
-        open_loop_errors(make_model(()), episodes)
+    other = CONSTANTS | {"position": {"low": [0.0] * 3, "high": [1.0] * 3}}  # such as the commanded pose
+    for model in (make_model(()), make_world_model(other, ("position",), latent_size=16, hidden_size=24)):
+        with pytest.raises(ValueError, match="position"):
+            open_loop_errors(model, episodes)
     with pytest.raises(ValueError, match=r"120, got 100 \+ 40"):
         open_loop_errors(make_model(), episodes, context=100)

@@ -35,13 +35,21 @@ def test_ignored_steps_do_not_count_with_emphasis():
     assert imitation_loss(action + error, action, normalizer, ignore, emphasis=4.0) == 0
 
 
+def test_an_ignored_action_does_not_weigh_the_step_after_it():
+    normalizer, ignore = Normalizer([-1.0], [1.0]), torch.tensor([[[False], [True], [False], [False]]])
+    action, error = torch.tensor([[[0.0], [0.9], [0.0], [0.5]]]), torch.tensor([[[0.0], [0.0], [0.1], [0.0]]])
+    loss = imitation_loss(action + error, action, normalizer, ignore, emphasis=4.0).item()
+    assert loss == pytest.approx(0.1 / (1 + 1 + 3))  # weights 1, ignored, 1, 1 + 4 / 2
+
+
+@pytest.mark.parametrize("emphasis", [0.0, 4.0])
 @pytest.mark.parametrize("ignore", [[True, False], [True, True]])
-def test_ignored_steps_may_be_nan(ignore):
+def test_ignored_steps_may_be_nan(ignore, emphasis):
     """The loss and its gradients are finite, also where no step counts."""
     action = torch.tensor([[[torch.nan], [0.5]]])
     predicted = torch.zeros(1, 2, 1, requires_grad=True)
     mask = torch.tensor(ignore).view(1, 2, 1)
-    loss = imitation_loss(predicted, action, Normalizer([-1.0], [1.0]), mask)
+    loss = imitation_loss(predicted, action, Normalizer([-1.0], [1.0]), mask, emphasis)
     loss.backward()
     assert loss == (0.0 if all(ignore) else 0.5)
     assert predicted.grad.isfinite().all()

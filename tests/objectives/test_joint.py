@@ -49,6 +49,11 @@ def test_joint_is_the_world_model_loss_and_the_weighted_policy_loss(td):
     assert all(map(moved, (model.encoder, model.image_decoder, model.dynamics_decoder, policy)))
 
 
+def test_imagined_steps_are_refused():
+    with pytest.raises(ValueError, match="imagined = 0, got 0.5"):
+        JointLoss(WorldModelLoss(make_model(), imagined=0.5), make()[2])
+
+
 def test_without_weight_the_world_model_learns_as_alone(td):
     loss, model, _ = make(beta_joint=0.0)
     sum(loss(td).values()).backward()

@@ -1,11 +1,12 @@
 """Keys, mouse and picture of the play window, without a display."""
 
+import numpy as np
 import pytest
 from small import CONSTANTS, make_model
 
 from dynmap_rl.envs.renderer import pygame
 from dynmap_rl.modules.actor import Actor
-from dynmap_rl.modules.checkpoints import make_policy
+from dynmap_rl.modules.checkpoints import make_policy, make_world_model
 from dynmap_rl.play.session import Session
 from dynmap_rl.play.window import PlayWindow
 
@@ -82,3 +83,17 @@ def test_with_a_world_model_its_prediction_is_shown():
     scene = window.renderer.draw(session.world, session.env.task)
     assert (window.draw()[left] != scene).any()
     window.close()
+
+
+def test_predictions_of_other_dynamics_are_not_compared():
+    other = CONSTANTS | {"position": {"low": [0.0] * 3, "high": [1.0] * 3}}  # such as the commanded pose
+    world_model = make_world_model(other, ("position",), latent_size=16, hidden_size=24).eval()
+    actor = Actor(world_model, make_policy(other, "recurrent", world_model, width=16).eval())
+    session = Session("balance_reaching", actor, delay=2)
+    window = PlayWindow(session, size=128)
+    for _ in range(4):
+        session.step()
+        window.draw()
+    window.close()
+    assert list(session.prediction) == ["pixels"]
+    assert np.isnan(np.stack(session.trace["position", "predicted"])).all()

@@ -40,6 +40,7 @@ def test_more_iterations_resume_the_run(finished, tmp_path):
     folder, _ = finished
     run_small(folder, "expert", "--run", "run", "--ppo.iterations", "3")
     assert list_checkpoints(folder / "run/checkpoint")[-1] == "iteration_003"
+    assert read_json(folder / "run/config.json")["ppo"]["iterations"] == 2, "those it began with"
 
 
 @pytest.mark.parametrize("arguments", [["--task", "nope"], ["--threads", "0"], ["--ppo.epochs", "0"]])

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from commands import run, run_small
+from commands import PRESETS, run, run_small
 from safetensors.torch import load_file
 from small import CONSTANTS
 
@@ -53,6 +53,14 @@ def test_a_run_compares_both(finished, world_model):
     again = run_small(folder, "latent_ppo", "--pretrained", world_model, "--run", "run")
     assert "complete" in again.stdout and printed.stdout.splitlines()[-2] in again.stdout
     assert (folder / "run" / WEIGHTS).stat().st_mtime_ns == before
+    torch.manual_seed(1)
+    other = make_world_model(CONSTANTS, ("position",), latent_size=16, hidden_size=24)
+    save_world_model(world_model / "world_model", other)  # trained again
+    for _ in range(2):  # a finished run, and one that resumes
+        preset = "--config_path", PRESETS / "latent_ppo.yaml"
+        changed = run(folder, "latent_ppo", *preset, "--pretrained", world_model, "--run", "run")
+        assert changed.returncode == 2 and "another world model" in changed.stderr
+        (folder / "run/eval.json").unlink(missing_ok=True)
 
 
 def test_what_the_policy_reads_is_what_imitating_policies_read(world_model):

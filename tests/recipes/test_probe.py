@@ -11,8 +11,13 @@ from dynmap_rl.utils.files import read_json, write_json
 @pytest.fixture(scope="module")
 def trained(recording, tmp_path_factory):
     folder, constants = tmp_path_factory.mktemp("runs"), load_meta(recording)["normalization"]
-    for name, supervision in (("none", ()), ("position", ("position",))):
-        save_world_model(folder / name / "world_model", make_world_model(constants, supervision))
+    pose = {q: {end: values[:3] for end, values in constants[q].items()} for q in ("position", "velocity")}
+    for name, supervision, ranges in (
+        ("none", (), constants),
+        ("position", ("position",), constants),
+        ("pose", ("position", "velocity"), constants | pose),  # such as the commanded pose of the cart
+    ):
+        save_world_model(folder / name / "world_model", make_world_model(ranges, supervision))
         source = {"task": "balance_reaching", "training": "decoupled"}
         write_json(folder / name / "eval.json", {"world_model": source})
     return folder
@@ -20,13 +25,15 @@ def trained(recording, tmp_path_factory):
 
 def test_writes_errors_and_probes_of_every_world_model(trained, recording, tmp_path):
     arguments = "--dataset", recording, "--context", "3", "--horizon", "4", "--train_episodes", "3"
-    result = run(tmp_path, "probe", "--runs", f"{trained / 'none'}, {trained / 'position'}", *arguments)
+    runs = ", ".join(str(trained / name) for name in ("none", "position", "pose"))
+    result = run(tmp_path, "probe", "--runs", runs, *arguments)
     assert result.returncode == 0, result.stderr
     facts = read_json(tmp_path / "runs/probe/probe.json")
     assert (facts["train_episodes"], facts["test_episodes"]) == (3, 2)
     assert list(facts["open_loop"]) == ["RGB+[P], decoupled"]
     assert len(facts["open_loop"]["RGB+[P], decoupled"]["model"]["cart_mm"]) == 4
-    assert list(facts["probes"]) == list(facts["verdicts"]) == ["Only-RGB, decoupled", "RGB+[P], decoupled"]
+    names = ["Only-RGB, decoupled", "RGB+[P], decoupled", "RGB+[P+V], decoupled"]
+    assert list(facts["probes"]) == list(facts["verdicts"]) == names
     assert len(facts["probes"]["Only-RGB, decoupled"]["latent"]["velocity"]) == 6
     for found in facts["perception"].values():
         assert list(found) == ["held-out demonstrations", "first ten steps"]
@@ -57,3 +64,8 @@ def test_bad_input_is_refused_before_anything_is_written(trained, recording, arg
     assert result.returncode == 2
     assert message in result.stderr and result.stderr.count("\n") == 1
     assert sorted(trained.rglob("*")) == before
+
+
+def test_a_dataset_of_another_task_is_refused(trained, recordings, tmp_path):
+    result = run(tmp_path, "probe", "--runs", trained / "none", "--dataset", recordings("bin_dropping"))
+    assert result.returncode == 2 and "must be a dataset of balance_reaching" in result.stderr

@@ -10,10 +10,11 @@ from dynmap_rl.data.features import compute_features
 from dynmap_rl.data.recording.plans import Plan, roll_out
 from dynmap_rl.envs.scene import scene_seed
 from dynmap_rl.experts.network import list_checkpoints
+from dynmap_rl.modules.actor import Actor
 from dynmap_rl.modules.checkpoints import make_policy
 from dynmap_rl.runs.folder import read_metrics
 from dynmap_rl.training import PolicyTraining, train_policies
-from dynmap_rl.training.dagger import add_corrections, collect_corrections
+from dynmap_rl.training.dagger import FIRST_SCENE, add_corrections, collect_corrections
 
 
 class Replay(torch.nn.Module):
@@ -61,6 +62,9 @@ def test_corrections_join_the_states_and_steps_after_a_failure_are_left_out():
     assert len(both) == len(features) + 2
     assert torch.equal(both["latent"][:-2], features["latent"])
     assert not torch.equal(both["goal"][-2], both["goal"][-1])
+    seeds = [scene_seed("train", FIRST_SCENE + i) for i in range(2)]
+    failed = collect_corrections(Actor(model, policy, mixed=True), "balance_reaching", seeds)["failed"]
+    assert failed.any() and torch.equal(both["disturbed"][-2:], failed)
     other = add_corrections(features, model, policy, "balance_reaching", scenes=2, seed=1)
     assert not torch.isin(other["goal"][-2:, 0, 0], both["goal"][-2:, 0, 0]).any()
 

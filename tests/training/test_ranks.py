@@ -11,7 +11,7 @@ from dynmap_rl.runs.folder import read_metrics
 from dynmap_rl.utils.ranks import DIED, leave_ranks, mean_over_ranks, rank, ranks
 
 SCRIPT = Path(__file__).with_name("two_ranks.py")
-TRAININGS = "world_model", "joint", "end_to_end"
+TRAININGS = "world_model", "labelled", "joint", "end_to_end"
 
 
 LAUNCHERS = "torchrun", "ray"

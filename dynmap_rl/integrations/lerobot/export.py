@@ -39,7 +39,6 @@ def export_to_lerobot(run: str | Path, folder: str | Path, seed: int = 0) -> Pat
     sizes = {"action": policy.action.size, "goal": policy.goal.size}
     if other := {name: size for name, size in sizes.items() if size != DynmapConfig().sizes[name]}:
         raise ValueError(f"{run} must be a run of a task of cart and block, got other sizes: {other}")
-    dynamics = {name: n.size for name, n in world_model.dynamics_decoder.normalizers.items()}
     files = run / "config.json", run / "eval.json"
     settings, results = (read_json(file) if file.exists() else {} for file in files)
     config = DynmapConfig(
@@ -51,7 +50,7 @@ def export_to_lerobot(run: str | Path, folder: str | Path, seed: int = 0) -> Pat
         hidden_size=world_model.hidden_size,
         architecture=world_model.architecture,
         width=policy.width,
-        sizes=DynmapConfig().sizes | dynamics,
+        sizes=DynmapConfig().sizes | world_model.sizes,
         input_features={
             CAMERA: PolicyFeature(FeatureType.VISUAL, (FRAME_SHAPE[2], *FRAME_SHAPE[:2])),
             OBS_STATE: PolicyFeature(FeatureType.STATE, (5,)),
