@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from tensordict.nn import TensorDictModule
 
 from dynmap_rl.envs.delay import FrameDelay
 from dynmap_rl.envs.renderer import Renderer
@@ -40,6 +41,12 @@ def test_an_episode_does_not_depend_on_the_others_in_its_batch():
     together, alone = (roll_out(make_actor(), "balance_reaching", some) for some in (seeds, seeds[1:]))
     torch.testing.assert_close(together["action"][1], alone["action"][0], rtol=1e-3, atol=1e-5)
     assert together.shape == (2, EPISODE_STEPS)
+
+
+def test_an_actor_may_have_no_parameters():
+    still = TensorDictModule(lambda agent_pos: torch.zeros(len(agent_pos), 3), ["agent_pos"], ["action"])
+    result = evaluate(still, "balance_reaching", Evaluation(episodes=2, paper_episodes=0))
+    assert result["test"]["summary"]["SR"] == 0
 
 
 @pytest.mark.parametrize("make", [lambda: DelayedActor(make_actor(), max_delay=5), make_actor])

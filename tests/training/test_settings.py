@@ -33,11 +33,14 @@ def test_settings_are_frozen_and_hashable(kind):
         (WorldModelTraining, {"learning_rate": -1e-3}),
         (WorldModelTraining, {"labelled": 1.1}),
         (WorldModelTraining, {"labelled": -0.1}),
+        (WorldModelTraining, {"imagined": 1.5}),
         (WorldModelTraining, {"beta_rgb": -1}),
         (PolicyTraining, {"kind": "transformer"}),
         (PolicyTraining, {"corrections": -1}),
         (JointTraining, {"beta_joint": -1}),
         (JointTraining, {"windows": 0}),
+        (JointTraining, {"short_windows": 7}),
+        (PPOTraining, {"gamma": 2.0}),
         (PPOTraining, {"epochs": 0}),
         (Augmentation, {"max_shift": -1}),
         (Evaluation, {"split": "train"}),
@@ -54,6 +57,11 @@ def test_a_bad_value_is_refused_and_named(kind, values):
 def test_a_world_model_that_would_learn_nothing_is_refused():
     with pytest.raises(ValueError, match=r"beta_rgb must be above 0"):
         WorldModelTraining(supervision="none", beta_rgb=0)
+
+
+def test_labels_without_supervision_are_refused():
+    with pytest.raises(ValueError, match="labelled has no effect"):
+        WorldModelTraining(supervision="none", labelled=0.5)
 
 
 def test_torch_is_not_imported():
