@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from collections import Counter
 from collections.abc import Sequence
 from statistics import NormalDist
 
 import numpy as np
+
+FEW = 10  # successes or failures
 
 # SciPy is imported where it is used: it takes a second, also in every process of an evaluation.
 
@@ -80,7 +83,8 @@ def shared_interval(rows_by_seed: list[list[dict]], outcome: str = "success") ->
 
     These episodes are not independent: a start state that is hard for one policy is hard for the others. The result is
     Wilson's interval for the effective number of independent episodes (Kish), which follows from the variance of the
-    means over the seeds. It is at least the number of start states, and at most the number of episodes.
+    means over the seeds. It is at least the number of start states, and at most the number of episodes. With fewer
+    than ten successes or failures, whose variance says little, it is the number of start states.
 
     Args:
         rows_by_seed: rows of the same scenes in the same order for every policy seed.
@@ -88,7 +92,8 @@ def shared_interval(rows_by_seed: list[list[dict]], outcome: str = "success") ->
     """
     values = np.array([[row[outcome] for row in rows] for rows in rows_by_seed], float)  # [seeds, starts]
     rate, starts = values.mean(), values.shape[1]
-    spread = values.mean(0).var(ddof=1) / starts if starts > 1 else 0.0
+    few = min(values.sum(), values.size - values.sum()) < FEW
+    spread = values.mean(0).var(ddof=1) / starts if starts > 1 and not few else 0.0
     count = np.clip(rate * (1 - rate) / spread, starts, values.size) if spread else starts
     return wilson(float(rate * count), float(count))
 
@@ -100,16 +105,36 @@ def student_interval(rates: Sequence[float]) -> tuple[float, float] | None:
         rates: a rate for each, in %.
 
     Returns:
-        The ends, within 0 and 100 %; None for fewer than two rates.
+        The ends, within 0 and 100 %; None for fewer than two rates, or equal ones, which do not say how rates vary.
     """
     from scipy.stats import t
 
     count = len(rates)
-    if count < 2:
+    if count < 2 or not np.ptp(rates):
         return None
     mean = float(np.mean(rates))
     half = float(t.ppf(0.975, count - 1)) * float(np.std(rates, ddof=1)) / count**0.5
     return max(mean - half, 0.0), min(mean + half, 100.0)
+
+
+def welch_interval(rates_a: Sequence[float], rates_b: Sequence[float]) -> tuple[float, float] | None:
+    """Return the 95 % interval (Welch's t) of the difference of two means of rates, such as those of world models.
+
+    Args:
+        rates_a: a rate for each, in %.
+        rates_b: likewise; its mean is subtracted.
+
+    Returns:
+        The ends, in points; None for fewer than two rates on a side, or if neither side varies.
+    """
+    from scipy.stats import ttest_ind
+
+    if min(len(rates_a), len(rates_b)) < 2 or not (np.ptp(rates_a) or np.ptp(rates_b)):
+        return None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # that one side does not vary
+        found = ttest_ind(rates_a, rates_b, equal_var=False).confidence_interval()
+    return float(found.low), float(found.high)
 
 
 def rate_gap(rows_a: list[list[dict]], rows_b: list[list[dict]], outcome: str = "success") -> dict:

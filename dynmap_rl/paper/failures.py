@@ -105,4 +105,5 @@ def _share(one: dict, cause: str) -> float:
 
 def _title(one: dict) -> str:
     training = "" if one["training"] == "end_to_end" else f", {one['training']}"
-    return f"{one['task']}: {one['row']}{training}, {one['policy']}"
+    count = len(one["runs"])
+    return f"{one['task']}: {one['row']}{training}, {one['policy']}, {count} world model{'s' * (count > 1)}"

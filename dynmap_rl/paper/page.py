@@ -32,7 +32,8 @@ the column says how those were trained.
   episode
 - [`delays/`](delays/README.md): success against the delay of the frames
 - [`benchmarks3d/`](benchmarks3d/README.md): the MuJoCo tasks
-- [`sources_plain/`](sources_plain/README.md): success against the source of the dynamics, with the paper's plain CNN
+- [`sources_plain/`](sources_plain/README.md): success against the source of the dynamics, with the paper's plain CNN; its
+  first world models were trained apart from those of the tables
 - [`measurements/`](measurements): other measurements
 - [`media/`](media): figures and animations
 - [`contents.json`](contents.json): descriptions for this page
@@ -48,16 +49,17 @@ paper.
 
 ## The paper's claims
 
-Every claim is a set of comparisons of two cells, paired over the 1,000 scenes that both share. A comparison holds if every
-world model of one cell is better than every world model of the other, as the claim says, and the interval of the gap does
-not include 0. It does not hold if the same is true the other way round. Otherwise, or with a single world model on one side,
-it is open. A claim has a verdict if all of its comparisons agree. A gap is the difference of the two rates in percentage
-points, with a 95 % bootstrap interval over the scenes.
+Every claim is a set of comparisons of two cells, paired over the 1,000 scenes that both share. A gap is the difference of the
+two rates in percentage points, with a 95 % bootstrap interval over the scenes, and p, the exact probability of a gap of this
+size if the two cells were exchanged at random in every scene. Both say nothing about further trainings. The 95 % interval
+over world models (Welch's) does; with three on either side it is wide.
+
+A comparison holds if p is below 0.05 and the interval over world models lies on the side that the claim says. It does not
+hold if that interval lies on the other side. Otherwise it is open, also with a single world model on one side or without any
+variation between them. A claim has a verdict if all of its comparisons agree. Comparisons with one and the same cell, such as
+Only-RGB, are no independent evidence. On task 3 the paper finds limited improvement by dynamics.
 
 {claims}
-
-Each comparison has p, the exact probability of a gap of this size if the two cells were exchanged at random in every scene.
-Like the interval, p says nothing about further trainings, and a verdict does not depend on it.
 
 <details><summary>Every comparison</summary>
 
@@ -73,7 +75,7 @@ shared start states: all policies of all world models on the same 1,000 scenes.
 Two intervals of 95 % stand in brackets. That over scenes is Wilson's for the effective number of independent episodes,
 since a scene that is hard for one policy is hard for the others. It says nothing about further trainings. That over world
 models is Student's for the mean of their success rates. With three world models it is wide: 2.5 times their standard
-deviation on either side.
+deviation on either side. Equal rates have none, since they do not say how much world models differ.
 
 {columns}
 
@@ -83,7 +85,8 @@ deviation on either side.
 
 ## What fails
 
-The failed episodes of the first policy of some runs, run again (`python recipes/paper/figures.py --only failures`). A drop is
+The failed episodes of the first policy of those runs of some cells that were at hand, run again
+(`python recipes/paper/figures.py --only failures`). A drop is
 named after the place and the cart's speed when the block began to tip; the causes are defined in
 [failures.py](../../dynmap_rl/evaluation/failures.py).
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.stats import spearmanr
+from scipy.stats import permutation_test, rankdata
 from tensordict import TensorDictBase
 
 from dynmap_rl.evaluation.probing import judge_states, probe
@@ -159,26 +159,37 @@ def data_table(results: Path, task: str) -> str:
 def rank_correlations(results: Path, task: str) -> dict[str, dict[str, float]]:
     """Return Spearman's rank correlation of each measure with SR, by policy, with its p and the number of sources.
 
-    There is none of less than five sources.
+    p is that of random pairings. There is no correlation of less than five sources.
     """
     correlations = {}
     for policy in POLICIES:
         for name in MEASURES:
             x, y, _ = measured_points(results, task, policy, name)
             if len(x) >= FEWEST:
-                found = spearmanr(x, y)
+                ranks, others = (rankdata(values) - (len(x) + 1) / 2 for values in (x, y))
+                size = np.linalg.norm(ranks) * np.linalg.norm(others)
+                found = permutation_test(
+                    (ranks,), lambda r, axis=-1, others=others, size=size: (r * others).sum(axis) / size,
+                    permutation_type="pairings", rng=np.random.default_rng(0),
+                )  # fmt: skip
                 numbers = {"rho": float(found.statistic), "p": float(found.pvalue), "sources": len(x)}
                 correlations[f"{policy}, {name}"] = numbers
     return correlations
 
 
 def measured_points(results: Path, task: str, policy: str, measure: str) -> tuple[list, list, list]:
-    """Return a measure, SR and name of every source that has both."""
+    """Return a measure, SR and name of every source, means over the world models that have both."""
     points = []
     for source in SOURCES:
-        cell, model = (read_source(results, task, source, p) for p in (policy, "recurrent"))
-        if cell and model and measure in model["measures"]:
-            points.append((model["measures"][measure], cell["SR"], source))
+        pairs = []
+        for seed in WORLD_MODELS:
+            path = results / f"{cell_name(task, source, seed, policy)}.json"
+            measured = results / "measures" / f"{cell_name(task, source, seed, 'recurrent')}.json"
+            if path.exists() and measured.exists():
+                rows = [row for of_seed in result_rows(read_json(path)) for row in of_seed]
+                pairs.append((read_json(measured)[measure], summarize(rows)["SR"]))
+        if pairs:
+            points.append((*np.mean(pairs, 0).tolist(), source))
     return tuple(map(list, zip(*points, strict=True))) if points else ([], [], [])
 
 

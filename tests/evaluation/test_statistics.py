@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.stats import permutation_test, ttest_1samp
+from scipy.stats import permutation_test, t, ttest_1samp
 
 from dynmap_rl.evaluation.statistics import (
     exchange_p,
@@ -11,6 +11,7 @@ from dynmap_rl.evaluation.statistics import (
     student_interval,
     summarize,
     summarize_seeds,
+    welch_interval,
     wilson,
 )
 
@@ -33,7 +34,18 @@ def test_students_interval_is_that_of_scipy_within_0_and_100():
     expected = ttest_1samp(rates, 0).confidence_interval(0.95)
     assert student_interval(rates) == pytest.approx((expected.low, expected.high))
     assert student_interval([90.0, 100.0]) == (pytest.approx(31.5, abs=0.1), 100.0)
-    assert student_interval([90.0]) is None
+    assert student_interval([90.0]) is None and student_interval([90.0, 90.0, 90.0]) is None
+
+
+def test_welchs_interval_is_the_textbook_one():
+    a, b = [90.0, 95.0, 97.0], [80.0, 70.0]
+    shares = np.var(a, ddof=1) / 3, np.var(b, ddof=1) / 2
+    freedom = sum(shares) ** 2 / (shares[0] ** 2 / 2 + shares[1] ** 2 / 1)
+    half = t.ppf(0.975, freedom) * sum(shares) ** 0.5
+    assert welch_interval(a, b) == pytest.approx((94 - 75 - half, 94 - 75 + half))
+    low, high = welch_interval([100.0] * 3, [99.7, 100.0, 100.0])
+    assert low < 0 < high, "one world model alone is worse"
+    assert welch_interval(a, [80.0]) is None and welch_interval([90.0] * 2, [80.0] * 2) is None
 
 
 def test_wilson_interval_is_the_textbook_one():
@@ -45,7 +57,10 @@ def test_wilson_interval_is_the_textbook_one():
 def test_seeds_that_agree_say_no_more_than_one():
     one = rows(70, count=100)
     assert shared_interval([one] * 3) == pytest.approx(wilson(70, 100))
-    assert shared_interval([rows(100, count=100)] * 3) == pytest.approx(wilson(100, 100))
+    for failures in (0, 1, 3):  # too few to tell how much the seeds agree
+        seeds = [rows(100 - failures, count=100), rows(100, count=100), rows(100, count=100)]
+        rate = 300 - failures
+        assert shared_interval(seeds) == pytest.approx(wilson(rate / 3, 100))
 
 
 def test_shared_interval_holds_the_rate_as_often_as_it_says():

@@ -36,9 +36,9 @@ def test_every_seed_of_joint_training_has_a_world_model(tmp_path):
     assert cell.rates() == [50.0, 75.0, 100.0] and not cell.missing
 
 
-def test_an_interval_over_world_models_that_agree_is_a_point(tmp_path):
+def test_world_models_that_agree_have_no_interval(tmp_path):
     write(tmp_path, "RGB+[P]", 40, 40, 40)
-    assert read_cells(tmp_path)[KEY].summary["world_model_interval"] == (100.0, 100.0)
+    assert read_cells(tmp_path)[KEY].summary["world_model_interval"] is None
 
 
 def test_commits_are_counted_by_run(tmp_path):
