@@ -90,6 +90,8 @@ def main(config: Config) -> None:
         print(f"{folder} is complete; delete it to run again\n\n{row_text(result, paper_numbers(result))}")
         return
 
+    augmentation = choose_augmentation(task, config.world_model.augmentation)
+    config = replace(config, world_model=replace(config.world_model, augmentation=augmentation))
     torch.set_num_threads(config.compute.threads)
     with first_rank_first():
         dataset = find_or_record(config.task, config.dataset)
@@ -97,9 +99,8 @@ def main(config: Config) -> None:
     if world_model is None:
         seed_everything(config.world_model.seed)
         world_model = build_world_model(constants, config.world_model, episodes["train"]).to(device)
-        augmentation = choose_augmentation(task, config.world_model.augmentation)
-        settings, by_entry = replace(config.world_model, augmentation=augmentation), not task.planar
-        train_world_model(world_model, episodes, folder, settings, logger=config.logger, by_entry=by_entry)
+        common = {"logger": config.logger, "by_entry": not task.planar}
+        train_world_model(world_model, episodes, folder, config.world_model, **common)
     if leave_ranks():
         return  # policies are small: the first process trains them
     judge = partial(judge_in_closed_loop, task=config.task, settings=config.eval)

@@ -85,10 +85,11 @@ def main(config: Config) -> None:
     augmentation = config.training.augmentation
     if not task.symmetric:  # the policy learns from the changed windows too
         augmentation = replace(augmentation, mirror=False, max_shift=0)
-    augmentation = choose_augmentation(task, augmentation)
+    training = replace(config.training, augmentation=choose_augmentation(task, augmentation))
+    config = replace(config, training=training)
     world_model = train_seeds(
         partial(load_demonstrations, dataset, config.cache), folder,
-        config.world_model, config.policy, replace(config.training, augmentation=augmentation),
+        config.world_model, config.policy, training,
         judge=partial(judge_in_closed_loop, task=config.task, settings=config.eval),
         seeds=seeds, compute=config.compute, logger=config.logger, by_entry=not task.planar,
     )  # fmt: skip

@@ -43,8 +43,8 @@ UPDATES = {  # of world models and policies, in the place of the defaults; chose
 
 PAGE = """# MuJoCo tasks
 
-Success in % with 95 % intervals for the start states, which the seeds of a cell share; with one seed, the interval says
-nothing about further trainings. Tasks, cameras and experts are described in
+Success in % with 95 % intervals for the start states, and that of each seed in brackets. The interval says nothing about
+further trainings, which differ by more. Tasks, cameras and experts are described in
 [dynmap_rl/envs/mujoco/README.md](../../../dynmap_rl/envs/mujoco/README.md). Written by
 `python recipes/paper/benchmarks3d.py --write` from the files in this folder.
 
@@ -232,5 +232,6 @@ def benchmark_page(rows: list[dict], folder: Path) -> str:
 def _describe(row: dict) -> str:
     low, high = row["SR_interval"]
     text = f"**{row['SR']:.1f}** [{low:.1f}, {high:.1f}]"
+    text += f" ({', '.join(f'{rate:.1f}' for rate in row['rates'])})" if row["seeds"] > 1 else ""
     text += f", off the table {row['DR']:.1f}" if row["DR"] else ""
     return text + (f" ({row['seeds']} of {len(SEEDS)} seeds)" if row["seeds"] < len(SEEDS) else "")

@@ -98,7 +98,10 @@ def _trainings() -> Iterator[Pair]:
 
 
 def _transfer() -> Iterator[Pair]:
-    for claim, task in (("Dynamics beat Only-RGB on task 2", TWO), ("Dynamics beat Only-RGB on task 3", THREE)):
+    for claim, task in (
+        ("Dynamics beat Only-RGB on task 2", TWO),
+        ("Dynamics beat Only-RGB on task 3", THREE),
+    ):
         for row in DYNAMICS_ROWS:
             pair = (task, "decoupled", "recurrent", row), (task, "decoupled", "recurrent", "Only-RGB")
             yield Pair(claim, _position(row), f"{row} - Only-RGB", *pair)

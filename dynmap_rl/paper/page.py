@@ -227,15 +227,11 @@ def _failures(path: Path) -> str:
 
 
 def _measurements(folder: Path, contents: dict[str, dict]) -> str:
-    rows = [
-        [
-            f"[{name}](measurements/{name})",
-            entry["what"],
-            _headline(read_json(folder / name)),
-            f"`{entry['command']}`",
-        ]
-        for name, entry in contents.items()
-    ]
+    rows = []
+    for name, entry in contents.items():
+        result = read_json(folder / name)
+        command = result.get("command", entry["command"])
+        rows.append([f"[{name}](measurements/{name})", entry["what"], _headline(result), f"`{command}`"])
     return join_table(["file", "what", "result", "command"], rows)
 
 

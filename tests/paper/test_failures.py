@@ -60,7 +60,9 @@ def test_a_row_has_the_shares_of_its_causes():
     assert (
         lines[0] == "| % of the episodes | fail | drops at the goal | stops short | succeeds when repeated |"
     )
-    assert lines[2] == "| balance_reaching: RGB+[P], decoupled, recurrent, 2 world models | 6.0 | 2.0 | 4.0 |  |"
+    assert (
+        lines[2] == "| balance_reaching: RGB+[P], decoupled, recurrent, 2 world models | 6.0 | 2.0 | 4.0 |  |"
+    )
     assert lines[3].endswith("| 2.0 |  |  | 2.0 |") and lines[4].endswith("| 0.0 |  |  |  |")
 
 

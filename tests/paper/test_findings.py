@@ -63,7 +63,9 @@ COMPARISON = "Dynamics beat Only-RGB", "task 1, recurrent: RGB+[P] - Only-RGB"
         ([20, 22, 18], [40], OPEN),  # a single world model
     ],
 )
-def test_a_claim_needs_a_gap_beyond_that_of_scenes_and_of_world_models(tmp_path, without, with_position, verdict):
+def test_a_claim_needs_a_gap_beyond_that_of_scenes_and_of_world_models(
+    tmp_path, without, with_position, verdict
+):
     write(tmp_path, "Only-RGB", *without)
     write(tmp_path, "RGB+[P]", *with_position)
     assert compare(tmp_path)[COMPARISON]["verdict"] == verdict
