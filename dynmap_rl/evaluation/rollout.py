@@ -130,9 +130,10 @@ def episode_rows(episodes: TensorDict, seeds: list[int]) -> list[dict]:
 
     Returns:
         Rows with ``scene_seed``, ``dropped``, ``touched`` (cart or block touched a wall of an obstacle or bin),
-        ``position_error`` (m) and ``success``. If the world model decodes positions of all bodies, ``localization_error`` is the mean distance between predicted
-        and true position of the first body, the cart or the object of a MuJoCo task (m), and
-        ``localization_error_away`` its mean over the steps more than 0.1 m from the goal.
+        ``position_error`` (m) and ``success``. If the world model decodes positions of all bodies,
+        ``localization_error`` is the mean distance between predicted and true position of the first body, the cart or
+        the object of a MuJoCo task (m), and ``localization_error_away`` its mean over the steps more than 0.1 m from the
+        goal.
     """
     last = episodes["next"][:, -1]
     rows = [

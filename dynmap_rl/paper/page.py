@@ -86,9 +86,8 @@ deviation on either side. Equal rates have none, since they do not say how much 
 ## What fails
 
 The failed episodes of the first policy of those runs of some cells that were at hand, run again
-(`python recipes/paper/figures.py --only failures`). A drop is
-named after the place and the cart's speed when the block began to tip; the causes are defined in
-[failures.py](../../dynmap_rl/evaluation/failures.py).
+(`python recipes/paper/figures.py --only failures`). A drop is named after the place and the cart's speed when the block began
+to tip; the causes are defined in [failures.py](../../dynmap_rl/evaluation/failures.py).
 
 {failures}
 

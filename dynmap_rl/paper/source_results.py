@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.stats import permutation_test, rankdata
+from scipy.stats import permutation_test, rankdata, spearmanr
 from tensordict import TensorDictBase
 
 from dynmap_rl.evaluation.probing import judge_states, probe
@@ -166,13 +166,16 @@ def rank_correlations(results: Path, task: str) -> dict[str, dict[str, float]]:
         for name in MEASURES:
             x, y, _ = measured_points(results, task, policy, name)
             if len(x) >= FEWEST:
-                ranks, others = (rankdata(values) - (len(x) + 1) / 2 for values in (x, y))
-                size = np.linalg.norm(ranks) * np.linalg.norm(others)
-                found = permutation_test(
-                    (ranks,), lambda r, axis=-1, others=others, size=size: (r * others).sum(axis) / size,
+                ranks, others = rankdata(x), rankdata(y)
+                found = permutation_test(  # of paired ranks, the sum of products varies as their correlation does
+                    (ranks,), lambda r, axis=-1, others=others: (r * others).sum(axis),
                     permutation_type="pairings", rng=np.random.default_rng(0),
                 )  # fmt: skip
-                numbers = {"rho": float(found.statistic), "p": float(found.pvalue), "sources": len(x)}
+                numbers = {
+                    "rho": float(spearmanr(x, y).statistic),
+                    "p": float(found.pvalue),
+                    "sources": len(x),
+                }
                 correlations[f"{policy}, {name}"] = numbers
     return correlations
 

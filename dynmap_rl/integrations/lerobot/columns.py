@@ -16,6 +16,8 @@ from dynmap_rl.data.normalization import normalization_constants
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.keys import NEEDED
 
+from .configuration_dynmap import GOAL
+
 DISTURBED, EXPERT_ACTION = "disturbed", "expert_action"
 
 
@@ -56,7 +58,7 @@ def read_columns(root: str | Path) -> TensorDict:
             f"{root} must have frames of different index, got repeated ones; repair the dataset or record it again"
         )
     data = {key: read_column(root, info, table, name) for key, name in columns.items()}
-    data["goal"] = data.pop("agent_pos")[:, -2:]
+    data["goal"] = data.pop("agent_pos")[:, -GOAL:]
     data["index"] = torch.tensor(index)
     data[DISTURBED] = data.get(DISTURBED, torch.zeros(len(table), 1)).bool()
     return TensorDict(data, [len(table)])
