@@ -23,7 +23,7 @@ MINUTES = {  # of one of two busy cores
     "baseline": 60,
 }
 VALIDATION = "--eval.split", "validation", "--eval.paper_episodes", "0"
-UNDISTURBED = "datasets/balance_reaching_undisturbed"
+UNDISTURBED = "datasets/{task}_undisturbed"
 ABLATIONS = {  # row: options that differ from the default
     "default": (),
     "no emphasis in the L1 loss": ("--policy.emphasis", "0"),
@@ -98,7 +98,7 @@ def list_runs() -> list[Run]:
     for seed in SEEDS[1:]:
         runs += [*_decoupled(seed), *_transfer(main, seed)]
     runs += [run for seed in SEEDS for s in SUPERVISIONS[:2] for run in _plain(s, seed)]
-    runs += [_ablate(row, seed) for seed in SEEDS for row in ABLATIONS]
+    runs += [_ablate(row, seed, task) for seed in SEEDS for task in TASKS[:2] for row in ABLATIONS]
     return runs + other + [run for seed in SEEDS for run in _transfer(other, seed)]
 
 
@@ -174,18 +174,33 @@ def _plain(supervision: str, seed: int) -> list[Run]:
     return [run, _reuse(run)]
 
 
-def _ablate(row: str, seed: int) -> Run:
-    """Return a run of RGB+[P+V] with recurrent policies and the options of a row, on validation scenes."""
-    default, options = _train(SUPERVISIONS[0], seed), ABLATIONS[row]
-    own = not all(
-        name.startswith("--policy.") for name in options[::2]
-    )  # else the world model is the default's
+def _ablate(row: str, seed: int, task: str) -> Run:
+    """Return a run of RGB+[P+V] with recurrent policies and the options of a row, on validation scenes.
+
+    On task 2 the world model is that of the row's run on task 1, as in Table II.
+    """
+    default, (first, second, _) = _train(SUPERVISIONS[0], seed), TASKS
+    options = tuple(option.format(task=task) for option in ABLATIONS[row])
+    own = not all(name.startswith("--policy.") for name in options[::2])  # else the default's world model
     words = "".join(c if c.isalnum() else " " for c in row.lower()).split()
-    return Run(
-        f"{TASKS[0]}_ablation_{'_'.join(words)}{_suffix(seed)}",
+    name = f"{first}_ablation_{'_'.join(words)}{_suffix(seed)}"
+    run = Run(
+        name,
         "decoupled",
         (*default.cell[:3], row),
         (*(default.arguments if own else default.arguments[:2]), *options, *VALIDATION),
         needs=None if own else default.name,
         table="ablations",
+    )
+    if task == first:
+        return run
+    pairs = zip(options[::2], options[1::2], strict=True)
+    kept = [part for pair in pairs if not pair[0].startswith("--world_model.") for part in pair]
+    return replace(
+        run,
+        name=name.replace(first, second, 1),
+        recipe="generalize",
+        cell=(second, *run.cell[1:]),
+        arguments=("--task", second, *kept, *VALIDATION),
+        needs=run.needs or name,
     )

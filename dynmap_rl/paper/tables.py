@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from dynmap_rl.evaluation.failures import CAUSES
 from dynmap_rl.evaluation.statistics import rate_gap, summarize
 
-from .cells import Key
+from .cells import TASKS, Key
 from .published import METRICS, TABLES
 from .results import COLUMNS, ROWS, Cell, count_commits
 
@@ -94,17 +94,17 @@ def markdown_own(cells: Mapping[Key, Cell], table: str) -> str:
     Args:
         cells: result of :func:`dynmap_rl.paper.results.read_cells` for this table and Table I.
         table: ``extra``, whose rows stand below those of Table I with the default world model, or ``ablations``, whose
-            first row is the default.
+            first row of each task is the default.
     """
     own, numbers, lines = [cell for cell in cells.values() if cell.table == table], ["DR", "PE"], []
+    ablations = table == "ablations"
     for cell in own:
-        if table == "ablations":
-            default, pair = own[0], [cell]
-        else:
-            default = cells.get((*cell.key[:-1], cell.row.removesuffix(", plain CNN")))
-            pair = [default, cell] if default else [cell]
-        lines += [[c.row, c.key[2], *_numbers(c, numbers), _difference(c, default)] for c in pair]
-    head = ["", "policy", *_head(numbers), "SR less the default's [scenes]"]
+        row = "default" if ablations else cell.row.removesuffix(", plain CNN")
+        default = cells.get((*cell.key[:-1], row))
+        for c in [cell] if ablations or not default else [default, cell]:
+            name = str(1 + TASKS.index(c.key[0])) if ablations else c.key[2]
+            lines.append([c.row, name, *_numbers(c, numbers), _difference(c, default)])
+    head = ["", "task" if ablations else "policy", *_head(numbers), "SR less the default's [scenes]"]
     return f"{join_table(head, lines)}\n\n{_notes(own)}"
 
 

@@ -123,8 +123,8 @@ def record_datasets(runs: list[Run]) -> None:
 
     for task in {run.task for run in runs if not run.dataset}:
         find_or_record(task)
-    for task in {run.task for run in runs if run.dataset == UNDISTURBED}:
-        record_dataset(UNDISTURBED, task, "undisturbed")
+    for task in {run.task for run in runs if run.dataset}:
+        record_dataset(UNDISTURBED.format(task=task), task, "undisturbed")
 
 
 def print_tables(results: Path, form: str) -> None:

@@ -5,7 +5,7 @@ from collections import Counter
 
 import pytest
 
-from dynmap_rl.paper.cells import ABLATIONS, SEEDS, TABLES, list_runs
+from dynmap_rl.paper.cells import ABLATIONS, SEEDS, TABLES, TASKS, list_runs
 from dynmap_rl.paper.published import TABLES as PUBLISHED
 from dynmap_rl.utils.cli import parse_settings, read_arguments
 
@@ -74,7 +74,8 @@ def test_the_first_seeds_of_the_decoupled_cells_come_first():
 
 
 def test_ablations_differ_from_the_default_in_one_option_on_validation_scenes():
-    runs = {run.cell[-1]: settings_of(run) for run in RUNS if run.table == "ablations"}
+    ablations = [run for run in RUNS if run.table == "ablations" and run.task == "balance_reaching"]
+    runs = {run.cell[-1]: settings_of(run) for run in ablations}
     assert list(runs) == list(ABLATIONS)
     assert all(run.eval.split == "validation" and not run.eval.paper_episodes for run in runs.values())
     flat = {row: parts(settings) for row, settings in runs.items()}
@@ -82,6 +83,23 @@ def test_ablations_differ_from_the_default_in_one_option_on_validation_scenes():
         seed = "world_model.seed"
         changed = {name for name, value in values.items() if name != seed and value != flat["default"][name]}
         assert len(changed) == (row != "default"), (row, changed)
+
+
+def test_ablations_of_task_2_use_the_world_models_of_task_1():
+    task = "balance_reaching_obstacle"
+    one, two = ([r for r in RUNS if r.table == "ablations" and r.task == t] for t in (TASKS[0], task))
+    assert [run.name.replace(TASKS[0], task, 1) for run in one] == [run.name for run in two]
+    assert [run.needs or run.name for run in one] == [run.needs for run in two]
+    default, changed = parts(settings_of(two[0])), {}
+    assert default["eval.split"] == "validation" and default["task"] == task
+    for run in two:
+        pairs = parts(settings_of(run)).items()
+        changed[run.cell[-1]] = {name: value for name, value in pairs if value != default[name]}
+    assert {row: options for row, options in changed.items() if options} == {
+        "no emphasis in the L1 loss": {"policy.emphasis": 0},
+        "corrections in 100 scenes (DAgger)": {"policy.corrections": 100},
+        "no pushes or noise in demonstrations": {"dataset": f"datasets/{task}_undisturbed"},
+    }
 
 
 def parts(settings, prefix="") -> dict:
