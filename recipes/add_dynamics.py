@@ -91,7 +91,7 @@ def main(config: Config) -> None:
     if (config.method or config.source) in ("central", "state"):
         refuse(config, Config(), ("window", "order"), "--method central")
     if not config.angles:
-        refuse(config, Config(), ("period", "angle_noise"), "no --angles")
+        refuse(config, Config(), ("period", "angle_noise"), "a state without --angles")
     settings = vars(config) | {
         "columns": parse_entries(config.columns, "--columns"),
         "angles": parse_entries(config.angles, "--angles") or [],

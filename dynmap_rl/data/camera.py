@@ -117,7 +117,9 @@ def choose_view(
         ValueError: an argument is wrong.
     """
     if source == "centroid" and (objects is not None or colors is not None or point):
-        raise ValueError("objects, colors and point have no effect with the source centroid; leave them out")
+        raise ValueError(
+            "--objects, --colors and --point have no effect with --source centroid; leave them out"
+        )
     if colors is not None:
         if objects is not None or sort != "lowest":
             raise ValueError("--objects and --sort have no effect with --colors; leave them out")

@@ -151,9 +151,8 @@ def load_meta(dataset: str | Path) -> dict:
 
     Returns:
         ``format``, ``task``, ``layout`` (except of cart and block), ``expert``, ``kind``, ``splits`` (name to first
-        episode and the one after the last), ``normalization`` (see :func:`dynmap_rl.data.normalization_constants`), and
-        ``episodes``, a dict for each:
-        ``episode_index``, ``split``, ``scene_seed``, ``checkpoint``, ``noise``, ``detours``, ``pushes``, ``scene``,
+        episode and the one after the last), ``normalization`` (see :func:`dynmap_rl.data.normalization_constants`),
+        ``rejected`` (number of failed candidates), and ``episodes``, a dict for each: ``episode_index``, ``split``, ``scene_seed``, ``checkpoint``, ``noise``, ``detours``, ``pushes``, ``scene``,
         ``success``, ``dropped``, ``position_error`` (m).
 
     Raises:

@@ -44,9 +44,7 @@ def probe(world_model: WorldModel, train: TensorDictBase, test: TensorDictBase) 
 def judge_states(probed: dict[str, dict]) -> dict:
     """Judge a world model by the velocities that a linear map reads from its best state, without a policy.
 
-    On task 1, with 300 demonstrations, the paper's plain CNN and one world model for each of ten sources of dynamics,
-    R^2 ranks the world models like the success of recurrent policies (rank correlation 0.94): those with 0.79 and more
-    succeed in at least 95.3 % of the scenes, the two with less (0.66 and 0.50) in 77.2 and 47.1 %
+    On task 1, with the paper's plain CNN, R^2 ranks sources of dynamics much like the success of recurrent policies
     (``recipes/results/sources_plain``). Other tasks have not been measured.
 
     Args:

@@ -65,10 +65,10 @@ class RobotActor:
         self.times: deque[float] = deque(maxlen=self.actor.max_delay + 1)  # of the last steps
 
     def observe(self, frame: np.ndarray, timestamp: float) -> None:
-        """Take a frame, uint8 ``[64, 64, 3]``, and the time at which it was taken.
+        """Take a frame, uint8 ``[S, cameras * S, 3]``, and the time at which it was taken.
 
         Raises:
-            ValueError: the frame is not uint8 ``[H, W, 3]``, or the time is not finite.
+            ValueError: the frame is not uint8 ``[H, W, 3]``, the time is not finite, or :meth:`reset` was not called.
         """
         frame = np.array(frame)  # a camera may use its buffer again
         if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[-1] != 3:
@@ -84,7 +84,8 @@ class RobotActor:
         """Return the action of the control step that begins now, float32 ``[A]`` (SI units).
 
         Raises:
-            ValueError: no frame has arrived before the first action, or ``now`` is not after the last call.
+            ValueError: no frame has arrived before the first action, ``now`` is not after the last call, or :meth:`reset`
+                was not called.
         """
         self._check_reset()
         if self.times and not now > self.times[-1]:

@@ -43,8 +43,9 @@ UPDATES = {  # of world models and policies, in the place of the defaults; chose
 
 PAGE = """# MuJoCo tasks
 
-Success in % with 95 % intervals for the start states, and that of each seed in brackets. The interval says nothing about
-further trainings, which differ by more. Tasks, cameras and experts are described in
+Success in %, [95 % interval over the scenes], (success of each seed). The interval says nothing about further trainings, which
+differ by more. Derived dynamics (of the hand, tracked, hand and color) are explained in
+[dynmap_rl/data/README.md](../../../dynmap_rl/data/README.md#which-source). Tasks, cameras and experts are described in
 [dynmap_rl/envs/mujoco/README.md](../../../dynmap_rl/envs/mujoco/README.md). Written by
 `python recipes/paper/benchmarks3d.py --write` from the files in this folder.
 
@@ -64,7 +65,7 @@ Mean distance of the object's predicted and true positions in these episodes, on
 
 ## Episodes
 
-Eight episodes of the first seed, failures first. At most four are failures if four others succeeded.
+Eight episodes of the first seed. Upper row: failures, where there are any; lower row: successes.
 
 {animations}
 

@@ -102,8 +102,8 @@ def delay_page(results: list[dict]) -> str:
             "",
             "Frames are late, and the goal is not. With `rolled forward`, the world model predicts the steps from the newest",
             "frame to the present; with `stale frames`, the policy treats the newest frame as the present one. The policy with",
-            "past actions reads the newest frame and the actions sent since; it was trained for delays of 0 to 30 steps alike,",
-            "and has no actions to read at 0 ms only. Policies of LeRobot also read the commanded pose of the cart, which is",
+            "past actions reads the newest frame and the actions sent since. It was trained with random delays of 0 to 30 steps;",
+            "at 0 ms there are no past actions to read, and it fails. Policies of LeRobot also read the commanded pose of the cart, which is",
             "not late, so that their rows and ours are no comparison on the same inputs. Every row is one world model and one",
             "policy.",
             "",
@@ -124,32 +124,42 @@ def delay_page(results: list[dict]) -> str:
 
 
 def plot_delays(results: list[dict], path: Path) -> None:
-    """Draw success with its intervals: lines against the delay, and dots for what was measured at a few delays.
-
-    Results with more than four delays are lines in the first panel. The other panels have a line of dots for each
-    supervision and policy of a task, on stale frames and rolled forward, or for each condition; of several runs of a
-    supervision, a dot is of the last one. A panel with less than two lines is left out.
+    """Draw success with its intervals against the delay: a line for each result with more than four delays.
 
     Args:
         results: see :func:`read_delays`.
         path: file to write.
     """
     lines = {_text(r): r for r in results if len(r["cells"]) > 4}
-    panels = [(title, dots) for title, dots in _dots(results).items() if len(dots) > 1]
-    count = bool(lines) + len(panels)
-    columns = min(count, 3) or 1
-    rows = -(-count // columns) or 1
-    size = 5.4 * columns, 3.6 * rows
-    figure, axes = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
-    for axis in axes.flat[count:]:
-        axis.remove()
+    figure, axis = plt.subplots(figsize=(7.5, 3), layout="constrained")
     if lines:
-        _draw_lines(axes.flat[0], lines)
-    for axis, (title, dots) in zip(axes.flat[bool(lines) :], panels, strict=False):
+        _draw_lines(axis, lines)
+    axis.grid(alpha=0.3)
+    save_figure(figure, path)
+
+
+def plot_conditions(results: list[dict], path: Path) -> None:
+    """Draw success with its intervals at a few delays as dots.
+
+    A panel has a line for each supervision and policy of a task, on stale frames and rolled forward, or for each
+    condition; of several runs of a supervision, a dot is of the last one. A panel with less than two lines is left out.
+
+    Args:
+        results: see :func:`read_delays`.
+        path: file to write.
+    """
+    panels = [(title, dots) for title, dots in _dots(results).items() if len(dots) > 1]
+    columns = min(len(panels), 2) or 1
+    rows = -(-len(panels) // columns) or 1
+    figure, axes = plt.subplots(
+        rows, columns, figsize=(5.4 * columns, 3.6 * rows), squeeze=False, layout="constrained"
+    )
+    for axis in axes.flat[len(panels) :]:
+        axis.remove()
+    for axis, (title, dots) in zip(axes.flat, panels, strict=False):
         _draw_dots(axis, title, dots)
-    for axis in axes.flat[:count]:
         axis.grid(alpha=0.3)
-        axis.tick_params(labelsize=7)
+        axis.tick_params(labelsize=8)
     save_figure(figure, path)
 
 
@@ -207,11 +217,8 @@ def _draw_lines(axis, lines: dict[str, dict]) -> None:
         style = "--" if CONDITIONS[result["condition"]][3] else "-"
         time = [_milliseconds(result, step) for step in steps]
         axis.errorbar(time, rates, errors, ls=style, lw=1.4, elinewidth=1, capsize=2, marker=".", label=label)
-    tasks = ", ".join(dict.fromkeys(result["task"] for result in lines.values()))
-    axis.set_title(f"{tasks}: success against the delay of the frames", fontsize=8)
-    axis.set_xlabel("delay of the frames [ms]", fontsize=8)
-    axis.set_ylabel("success [%]", fontsize=8)
-    axis.legend(fontsize=6, loc="upper center", bbox_to_anchor=(0.5, -0.16))
+    axis.set(xlabel="delay of the frames [ms]", ylabel="success [%]", ylim=(-3, 103))
+    axis.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.02, 0.5))
 
 
 def _draw_dots(axis, title: str, dots: dict[str, dict[str, dict]]) -> None:
@@ -224,10 +231,10 @@ def _draw_dots(axis, title: str, dots: dict[str, dict[str, dict]]) -> None:
         color = {"no delay": "C7", "stale": "C1"}.get(label.split(" frames")[0], "C0")
         axis.errorbar(rates, places, xerr=_errors(cells), label=label, color=color, **style)
     axis.set_yticks(range(len(names)), names)
-    axis.invert_yaxis()
-    axis.set_title(title, fontsize=8)
+    axis.set(xlim=(-2, 102), ylim=(len(names) - 0.5, -0.5))
+    axis.set_title(title, fontsize=9)
     axis.set_xlabel("success [%]", fontsize=8)
-    axis.legend(fontsize=6, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
+    axis.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
 
 
 def _order(label: str) -> tuple[bool, bool, int]:

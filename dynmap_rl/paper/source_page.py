@@ -30,9 +30,9 @@ def write_source_page(results: Path, tasks: list[str], architecture: str = "glim
     """
     parts = [
         "# Sources of dynamics, and numbers of demonstrations",
-        f"World models have {FORMS[architecture]}. SR in % with 95 % intervals over world models and policies on the "
-        "shared start states; with one world model, the interval does not know how much world models differ. The share "
-        "of the gain is that of the simulator's dynamics over Only-RGB. Measures are means over world models. Derived "
+        f"World models have {FORMS[architecture]}. SR in % with 95 % intervals over the test scenes, which do not cover "
+        "differences between trainings. Share of the gain: (SR - SR of Only-RGB) / (SR with the simulator's dynamics - SR "
+        "of Only-RGB). Measures are means over the world models that have been probed. Derived "
         "columns have the verdict of `add_dynamics.py`, before any training, with the checks that failed. Written by "
         "`recipes/paper/sources.py --write`.",
     ]

@@ -24,7 +24,7 @@ FEWEST = 5  # sources of a rank correlation
 MEASURES = {  # name: text, and the sign with which it should rise with success
     "probe_position": ("R^2 of a linear map to the positions", 1),
     "probe_velocity": ("R^2 of a linear map to the velocities", 1),
-    "open_loop_mm": ("error after 2 s without frames, by a linear map (mm)", -1),
+    "open_loop_mm": ("error after 2 s without frames (mm)", -1),
 }
 
 

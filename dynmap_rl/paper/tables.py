@@ -104,7 +104,7 @@ def markdown_own(cells: Mapping[Key, Cell], table: str) -> str:
         for c in [cell] if ablations or not default else [default, cell]:
             name = str(1 + TASKS.index(c.key[0])) if ablations else c.key[2]
             lines.append([c.row, name, *_numbers(c, numbers), _difference(c, default)])
-    head = ["", "task" if ablations else "policy", *_head(numbers), "SR less the default's [scenes]"]
+    head = ["", "task" if ablations else "policy", *_head(numbers), "SR minus the default's [scenes]"]
     return f"{join_table(head, lines)}\n\n{_notes(own)}"
 
 

@@ -188,13 +188,12 @@ def plot_distributions(dynamics: dict[str, TensorDictBase], path: Path) -> dict[
     ranges: dict[str, dict[str, list[float]]] = {task: {} for task in dynamics}
     for column, (title, (quantity, index, unit)) in enumerate(panels.items()):
         values = {task: d[quantity][..., index].flatten().double().numpy() for task, d in dynamics.items()}
-        limit = max(np.abs(v).max() for v in values.values())
         for row, (task, value) in enumerate(values.items()):
-            axis = axes[row, column]
+            axis, limit = axes[row, column], np.abs(value).max() or 1
             axis.hist(value, bins=np.linspace(-limit, limit, 81), log=True, color="tab:green")
-            axis.set_title(f"{title} [{unit}]" if row == 0 else "", fontsize=8)
-            axis.set_ylabel(task if column == 0 else "", fontsize=8)
-            axis.tick_params(labelsize=6)
+            axis.set_title(f"{title} [{unit}]" if row == 0 else "", fontsize=9)
+            axis.set_ylabel(f"{task}\nsteps" if column == 0 else "", fontsize=8)
+            axis.tick_params(labelsize=7)
             ranges[task][title] = np.quantile(np.abs(value), (0.001, 0.5, 0.999)).round(4).tolist()
     save_figure(figure, path)
     return ranges

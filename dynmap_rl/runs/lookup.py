@@ -37,11 +37,11 @@ def find_run(run: str | Path) -> Path:
         return Path(snapshot_download(run, allow_patterns=parts))
     except (OSError, ValueError, HTTPError) as error:  # the hub's client, or the network below it
         reason = first_line(error)
-        raise ValueError(f"no policy at {run}, neither as a folder nor on the hub ({reason})") from error
+        raise ValueError(f"no run at {run}, neither as a folder nor on the hub ({reason})") from error
 
 
 def load_actor(run: str | Path, seed: int = 0) -> Actor:
-    """Load world model and policy of a run as they act in its evaluation.
+    """Load world model and policy of a run, in evaluation mode and in the precision of the recipes' evaluation.
 
     Args:
         run: see :func:`find_run`; ``"balance_reaching"`` ships with the package.

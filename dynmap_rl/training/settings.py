@@ -194,9 +194,9 @@ class PPOTraining:
     steps: int = 40
     # Iterations: rollouts and the updates from them.
     iterations: int = 60
-    # Passes over the frames of an iteration.
+    # Passes over the transitions of an iteration.
     epochs: int = 8
-    # Frames in a minibatch.
+    # Transitions in a minibatch.
     minibatch: int = 1024
     # Initial learning rate, which falls to a tenth.
     learning_rate: float = 5e-4

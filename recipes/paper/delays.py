@@ -181,17 +181,21 @@ def train_past_actions(folder: Path, dataset: str | Path, settings: PolicyTraini
 
 
 def write(config: Config) -> None:
-    """Draw the figure and write the table from the results."""
-    from dynmap_rl.paper.delays import delay_page, plot_delays, read_delays
+    """Draw the figures and write the table from the results."""
+    from dynmap_rl.paper.delays import delay_page, plot_conditions, plot_delays, read_delays
     from dynmap_rl.utils.files import write_bytes
 
     results = read_delays(config.results)
     if not results:
         raise ValueError(f"{config.results} must have results; run recipes/paper/delays.py first")
+    page, conditions = (
+        config.results / "README.md",
+        config.figure.with_stem(f"{config.figure.stem}_conditions"),
+    )
     plot_delays(results, config.figure)
-    page = config.results / "README.md"
+    plot_conditions(results, conditions)
     write_bytes(page, delay_page(results).encode())
-    print(f"written: {page}, {config.figure}")
+    print(f"written: {page}, {config.figure}, {conditions}")
 
 
 if __name__ == "__main__":

@@ -157,7 +157,7 @@ files = [sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_fi
 assert files[0] == files[1]
 for ours, theirs in zip(*(load_actor(name).state_dict().values() for name in (run, "someone/run"))):
     assert torch.equal(ours, theirs)
-with pytest.raises(ValueError, match="no policy at someone/else, neither as a folder nor on the hub"):
+with pytest.raises(ValueError, match="no run at someone/else, neither as a folder nor on the hub"):
     find_run("someone/else")
 """
 

@@ -31,15 +31,16 @@ def test_the_table_has_a_line_for_each_condition_and_a_column_for_each_delay(tmp
     assert "1. `runs/some`: `python train`" in page
 
 
-def test_long_results_are_lines_and_others_are_dots_of_supervisions_and_conditions(tmp_path, monkeypatch):
+def test_results_of_many_delays_are_lines_and_a_few_delays_are_dots(tmp_path, monkeypatch):
     saved = []
     monkeypatch.setattr(delays, "save_figure", lambda figure, path: saved.append(figure))
     stale, imagined = make_results(tmp_path)
     long = imagined | {"row": "act", "policy": "LeRobot"}
     long["cells"] = {str(steps): stale["cells"]["10"] for steps in (0, 2, 4, 6, 8)}
     others = [result | {"row": "Only-RGB"} for result in (stale, imagined)]
-    delays.plot_delays([stale, imagined, *others, long], tmp_path / "figure.png")
-    lines, supervisions = saved[0].axes
+    for plot in (delays.plot_delays, delays.plot_conditions):
+        plot([stale, imagined, *others, long], tmp_path / "figure.png")
+    [lines], [supervisions] = (figure.axes for figure in saved)
     assert read_lines(lines) == {
         "ACT: chunks from the present step": [[0, 5], [100, 5], [200, 5], [300, 5], [400, 5]]
     }
@@ -57,7 +58,7 @@ def test_a_marker_of_one_supervision_is_left_out(tmp_path, monkeypatch):
     monkeypatch.setattr(delays, "save_figure", lambda figure, path: saved.append(figure))
     stale, imagined = make_results(tmp_path)
     other = imagined | {"row": "Only-RGB"}
-    delays.plot_delays([stale, imagined, other], tmp_path / "figure.png")
+    delays.plot_conditions([stale, imagined, other], tmp_path / "figure.png")
     assert [*read_lines(saved[0].axes[0])] == ["no delay", "rolled forward, 500 ms"]
     plt.close("all")
 
@@ -67,7 +68,7 @@ def test_conditions_of_a_run_share_a_panel(tmp_path, monkeypatch):
     monkeypatch.setattr(delays, "save_figure", lambda figure, path: saved.append(figure))
     _, imagined = make_results(tmp_path)
     jitter, lost = (imagined | {"condition": name} for name in ("jitter", "lost_10"))
-    delays.plot_delays([imagined, jitter, lost], tmp_path / "figure.png")
+    delays.plot_conditions([imagined, jitter, lost], tmp_path / "figure.png")
     (panel,) = saved[0].axes
     assert read_lines(panel) == {"0 ms": [[99, -0.075], [99, 0.925]], "500 ms": [[95, 0.075], [95, 1.075]]}
     plt.close("all")

@@ -307,7 +307,7 @@ def test_state_and_tracks_stand_side_by_side_and_are_judged_together(videos, tmp
             {"source": "tracks", "method": "central", "order": 4},
             "--order has no effect with --method central",
         ),
-        ({"period": 360.0}, "--period has no effect with no --angles"),
+        ({"period": 360.0}, "--period has no effect with a state without --angles"),
     ],
 )
 def test_bad_input_is_refused_before_anything_is_written(images, tmp_path, settings, message):

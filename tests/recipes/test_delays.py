@@ -50,7 +50,7 @@ def test_cells_are_measured_once(grid, tmp_path):
             and read_json(path)["cells"]["2"] == found[name]["cells"]["2"]
         )
         assert path.read_bytes() != before[name]
-    assert (tmp_path / "delays.png").exists()
+    assert (tmp_path / "delays.png").exists() and (tmp_path / "delays_conditions.png").exists()
     page = (tmp_path / "found/README.md").read_bytes()
     (tmp_path / "found/README.md").unlink()
     assert grid("--write").returncode == 0
