@@ -15,7 +15,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynmap_rl.utils.cli import command_line, refuse, run_recipe
+from dynmap_rl.utils.cli import command_line, parse_numbers, refuse, run_recipe
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,6 @@ def main(config: Config) -> None:
     from dynmap_rl.data.derive import add_dynamics
     from dynmap_rl.data.format.reading import find_dataset
     from dynmap_rl.data.quality import quality_text, worst_episode
-    from dynmap_rl.data.state import parse_entries
     from dynmap_rl.reporting.dataset_page import write_dataset_page
     from dynmap_rl.reporting.track_figure import plot_tracks
     from dynmap_rl.runs.folder import plain_settings
@@ -93,8 +92,8 @@ def main(config: Config) -> None:
     if not config.angles:
         refuse(config, Config(), ("period", "angle_noise"), "a state without --angles")
     settings = vars(config) | {
-        "columns": parse_entries(config.columns, "--columns"),
-        "angles": parse_entries(config.angles, "--angles") or [],
+        "columns": None if config.columns is None else parse_numbers(config.columns, "--columns"),
+        "angles": [] if config.angles is None else parse_numbers(config.angles, "--angles"),
         "colors": config.colors.split(",") if config.colors is not None else None,
     }
     found = add_dynamics(**settings)

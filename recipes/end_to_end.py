@@ -79,10 +79,8 @@ def main(config: Config) -> None:
 
     with first_rank_first():
         dataset = find_or_record(config.task, config.dataset)
-    augmentation = config.training.augmentation
-    if not task.symmetric:  # the policy learns from the changed windows too
-        augmentation = replace(augmentation, mirror=False, max_shift=0)
-    training = replace(config.training, augmentation=choose_augmentation(task, augmentation))
+    augmentation = choose_augmentation(task, config.training.augmentation, imitated=True)
+    training = replace(config.training, augmentation=augmentation)
     config = replace(config, training=training)
     world_model = train_seeds(
         partial(load_demonstrations, dataset, config.cache), folder,

@@ -135,14 +135,12 @@ def read_delay(config: Config):
 
 def load_policy(config: Config, folder: Path, instruction: str):
     """Load the actor of a run, or a LeRobot policy, which gets the task as an instruction."""
-    from dynmap_rl.runs.lookup import load_actor
+    from dynmap_rl.runs.lookup import has_world_model, load_actor
     from dynmap_rl.utils.devices import choose_device
 
     if not folder.exists():
-        raise ValueError(
-            f"--policy must be a run or a policy, got {config.policy}; train one with recipes/decoupled.py"
-        )
-    if (folder / "world_model").exists() or any(folder.glob("seed_*")):
+        raise ValueError(f"--policy must be a run or a policy, got {config.policy}; see recipes/README.md")
+    if has_world_model(folder):
         return load_actor(folder, config.seed).to(choose_device(config.compute.device))
     if not Path(config.policy).expanduser().exists() and not config.trust_remote_code:
         raise ValueError(
@@ -161,9 +159,10 @@ def load_policy(config: Config, folder: Path, instruction: str):
 
 def judge_expert(config: Config) -> tuple[Path, str, dict]:
     """Return the folder with an animation, the numbers as text, and the result: ``rates`` and ``intervals`` (%)."""
+    from dynmap_rl.envs.scene import scene_seeds
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.evaluation.experts import judge_demonstrator, list_outcomes
-    from dynmap_rl.evaluation.rollout import failures_first, scene_seeds
+    from dynmap_rl.evaluation.rollout import failures_first
     from dynmap_rl.evaluation.statistics import wilson
     from dynmap_rl.experts.careless import CarelessController
     from dynmap_rl.experts.network import list_checkpoints, load_expert, roll_out, task_of_expert

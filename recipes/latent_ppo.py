@@ -29,7 +29,7 @@ class Config:
     # Run folder; by default runs/latent_ppo/TASK.
     run: Path | None = None
     # Training.
-    ppo: PPOTraining = PPOTraining(iterations=90, checkpoint_every=10)
+    ppo: PPOTraining = PPOTraining(iterations=90)
     # Width of the network's hidden layers.
     hidden: int = 128
     # Threads of torch, and processes that roll worlds out.

@@ -21,8 +21,9 @@ from tensordict import TensorDict
 
 from dynmap_rl.utils.files import check_space
 
+from .decoding import Allocate
+
 FORMAT = 1  # of the entries
-Allocate = Callable[[str | tuple[str, str], tuple[int, ...], torch.dtype], torch.Tensor]
 
 
 def open_cached(

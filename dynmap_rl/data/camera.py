@@ -183,15 +183,12 @@ def measure(frames: np.ndarray, factor: float, camera: Camera, fps: float) -> Mo
     Raises:
         ValueError: what should be tracked is not found. The message is the end of a sentence.
     """
-    height, width = frames.shape[1:3]
+    (count, height, width), size = frames.shape[:3], camera.size
+    place, scale = _scale(height, width, factor, camera.width, size)
     if camera.source == "centroid":
         centroid, found = track_centroid(frames, camera.threshold)
-        place, scale = _scale(height, width, factor, camera.width, 2)
         return Motion(place(centroid), [], found=found[:, None])
     tracks = track(frames, camera)
-    size = camera.size
-    place, scale = _scale(height, width, factor, camera.width, size)
-    count = len(frames)
     position = place(tracks.pose[..., :size]).reshape(count, -1)
     flow = (flow_velocity(frames, tracks)[..., :size] * scale * fps).reshape(count, -1)
     angles = [] if camera.point else list(range(2, position.shape[1], 3))
@@ -206,13 +203,9 @@ def track(frames: np.ndarray, camera: Camera) -> Tracks:
 
 def _scale(height: int, width: int, factor: float, metres: float | None, size: int):
     """Return the map from pixels of reduced frames to positions, and the factors of differences."""
-    if metres is None:
-        scale = np.array([factor, factor, 1.0])[:size]
-        return lambda pose: (pose + _shift(0.5, size)) * scale - _shift(0.5, size), scale
-    scale = np.array([metres / width, -metres / width, -1.0])[:size]
-    origin = np.array([0.0, metres * height / width, 0.0])[:size]
-    return lambda pose: (pose + _shift(0.5, size)) * scale + origin, scale
-
-
-def _shift(pixels: float, size: int) -> np.ndarray:
-    return np.array([pixels, pixels, 0.0])[:size]
+    middle = np.array([0.5, 0.5, 0.0])[:size]  # of a pixel
+    scale, origin = np.array([factor, factor, 1.0])[:size], -middle
+    if metres is not None:
+        scale = np.array([metres / width, -metres / width, -1.0])[:size]
+        origin = np.array([0.0, metres * height / width, 0.0])[:size]
+    return lambda pose: (pose + middle) * scale + origin, scale

@@ -71,17 +71,13 @@ def decode_episodes(
     new("goal", [layout.goal_size], torch.float32)[:] = values["agent_pos"][:, -layout.goal_size :]
     if "disturbed" not in values:
         new("disturbed", [1], torch.bool).zero_()
+    step = torch.arange(steps).repeat(count)
     for flag in FLAGS:
         new(flag, [1], torch.bool).zero_()
-        new(("next", flag), [1], torch.bool)[:, 0] = torch.tensor([flag != "terminated"]) & _is_last(shape)
+        new(("next", flag), [1], torch.bool)[:, 0] = (step == steps - 1) & (flag != "terminated")
     new("episode", [], torch.int64)[:] = torch.tensor(episodes).repeat_interleave(steps)
-    new("step_count", [1], torch.int64)[:, 0] = torch.arange(steps).repeat(count)
+    new("step_count", [1], torch.int64)[:, 0] = step
     return TensorDict(data, shape)
-
-
-def _is_last(shape: tuple[int, int]) -> torch.Tensor:
-    """Return a mask ``[E * T]`` of the last steps of the episodes."""
-    return torch.arange(1, shape[0] * shape[1] + 1) % shape[1] == 0
 
 
 def _place_rows(root: Path, table: pa.Table, order: Callable) -> tuple[list[int], np.ndarray]:

@@ -13,11 +13,12 @@ import torch
 from tensordict import TensorDict
 
 from dynmap_rl.keys import DYNAMICS
+from dynmap_rl.utils.cli import parse_numbers
 
 from .format.frames import choose_camera, iterate_frames
 from .format.reading import choose_splits, find_dataset, read_column, read_info, read_table, spans
 from .normalization import range_constants
-from .state import entry_names, parse_entries
+from .state import entry_names
 
 LONGEST = 120  # steps of a piece; longer pieces make batches of whole pieces slow
 
@@ -135,7 +136,7 @@ def _check_goal(root: Path, info: dict, goal: str | None) -> tuple[str, list[int
     if goal is None:
         return None
     column, _, text = goal.rpartition(":")
-    entries = parse_entries(text, "--goal: entries after the colon")
+    entries = parse_numbers(text, "--goal: entries after the colon")
     feature = info["features"].get(column)
     if feature is None or feature["dtype"] not in ("float32", "float64") or len(feature["shape"]) != 1:
         raise ValueError(

@@ -99,22 +99,6 @@ def read_state(root: Path, info: dict, state: State) -> Iterator[tuple[int, Moti
         yield episode, Motion(position[rows], state.angles, state.period)
 
 
-def parse_entries(text: str | None, option: str) -> list[int] | None:
-    """Read a text such as ``0,2`` as numbers; None stays None.
-
-    Args:
-        text: the text.
-        option: name of the option, for the message.
-
-    Raises:
-        ValueError: the text is not a list of whole numbers.
-    """
-    try:
-        return None if text is None else [int(entry) for entry in text.split(",")]
-    except ValueError as error:
-        raise ValueError(f"{option} must be whole numbers such as 0,1,2, got {text!r}") from error
-
-
 def entry_names(info: dict, column: str) -> list[str]:
     """Return a name for every entry of a column: the dataset's own names, or numbers where it has none."""
     feature = info["features"][column]

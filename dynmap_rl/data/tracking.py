@@ -224,11 +224,11 @@ def _split(frames: np.ndarray, masks: np.ndarray, objects: int, threshold: int) 
 
 
 def _merge(centers: np.ndarray, threshold: int) -> np.ndarray:
-    """Return for each colour the number of the first of those that differ by less than the threshold, in chains."""
+    """Return for each colour the number of its group: colours that differ by less than the threshold, in chains."""
+    from scipy.sparse.csgraph import connected_components
+
     close = np.abs(centers[:, None] - centers).max(-1) < threshold
-    for _ in centers:
-        close = close @ close
-    return close.argmax(1).astype(np.uint8)
+    return connected_components(close)[1].astype(np.uint8)
 
 
 def _motion(masks: np.ndarray) -> float:

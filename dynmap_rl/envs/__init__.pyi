@@ -10,6 +10,7 @@ from .scene import Scene as Scene
 from .scene import SceneRanges as SceneRanges
 from .scene import sample_scene as sample_scene
 from .scene import scene_seed as scene_seed
+from .scene import scene_seeds as scene_seeds
 from .task import Task as Task
 from .task_env import TaskEnv as TaskEnv
 from .tasks import BalanceReaching as BalanceReaching

@@ -124,16 +124,15 @@ class ImaginationEnv(ModelBasedEnvBase):
         """Do nothing, as nothing is random."""
 
 
-def make_start(world_model: WorldModel, frames: TensorDictBase, mixed: bool = False) -> TensorDictBase:
+def make_start(world_model: WorldModel, frames: TensorDictBase) -> TensorDictBase:
     """Make a start of :class:`ImaginationEnv` from the first frames of episodes, at the last of these frames.
 
     Args:
         world_model: world model that encodes the frames.
         frames: ``[B, T]``, T >= 1, with ``pixels``, ``action`` (the last one is not used) and optionally ``goal``.
-        mixed: encode in the precision of training.
 
     Returns:
         TensorDict ``[B]`` with ``latent``, ``predicted_latent``, the memory and the goal.
     """
     frames = frames.select("pixels", "action", "goal", strict=False)
-    return WorldModelTransform(world_model, mixed=mixed)(frames).exclude("pixels", "action")[:, -1]
+    return WorldModelTransform(world_model)(frames).exclude("pixels", "action")[:, -1]

@@ -198,6 +198,11 @@ def scene_seed(split: str, index: int) -> int:
     return SPLITS[split] * SEEDS_PER_SPLIT + index
 
 
+def scene_seeds(split: str, count: int, start: int = 0) -> list[int]:
+    """Return the seeds of the scenes ``start`` to ``start + count - 1`` of a split."""
+    return [scene_seed(split, start + i) for i in range(count)]
+
+
 def choose_ranges(own: SceneRanges | None, ranges: SceneRanges | None) -> SceneRanges | None:
     """Return ``ranges``, or a task's ``own`` ones for None.
 

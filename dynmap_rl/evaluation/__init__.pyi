@@ -9,7 +9,6 @@ from .protocol import evaluate as evaluate
 from .protocol import judge_in_closed_loop as judge_in_closed_loop
 from .rollout import episode_rows as episode_rows
 from .rollout import roll_out as roll_out
-from .rollout import scene_seeds as scene_seeds
 from .settings import Evaluation as Evaluation
 from .statistics import rate_gap as rate_gap
 from .statistics import shared_interval as shared_interval

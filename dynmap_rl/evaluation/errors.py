@@ -9,11 +9,11 @@ from tensordict import TensorDictBase
 from torch import nn
 
 from dynmap_rl.data.features import compute_features
+from dynmap_rl.modules.actor import STATES
 from dynmap_rl.modules.world_model import WorldModel
 from dynmap_rl.objectives.imitation import ImitationLoss, imitation_loss
 
 GROUPS = {"": (0, 1), "_angle": (2,)}  # entries of a body's dynamics (x, y, theta) that share a unit
-STATES = ("latent", "hidden1", "hidden2", "goal")
 
 
 @torch.no_grad()
@@ -72,7 +72,7 @@ def policy_errors(policy: nn.Module, features: TensorDictBase) -> dict[str, floa
         in the dataset's units, ``error_action_0`` and so on.
     """
     features = features.to(next(policy.parameters()).device)
-    predicted = policy(*(features[key] for key in STATES))
+    predicted = policy(*(features[key] for key in (*STATES, "goal")))
     loss = imitation_loss(predicted, features["action"], policy.action, features["disturbed"])
     entries = (predicted - features["action"]).abs().mean((0, 1)).tolist()
     return {"imitation_l1": loss.item()} | {f"error_action_{i}": e for i, e in enumerate(entries)}

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from dynmap_rl.envs.geometry import path_is_blocked, way_from_start
 from dynmap_rl.envs.protocol import BaseTask
-from dynmap_rl.envs.scene import ObstacleScene, scene_seed
+from dynmap_rl.envs.scene import ObstacleScene, scene_seeds
 from dynmap_rl.envs.task import Task
 from dynmap_rl.envs.world import World
 
@@ -78,4 +78,4 @@ def judge_demonstrator(task: BaseTask, seeds: Iterable[int]) -> dict[str, list[b
 
 def fresh_scenes(count: int) -> list[int]:
     """Return the seeds of ``count`` scenes that are neither trained on nor test scenes of the tables."""
-    return [scene_seed("exploration", 10_000_000 + i) for i in range(count)]
+    return scene_seeds("exploration", count, start=10_000_000)

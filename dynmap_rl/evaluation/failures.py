@@ -18,6 +18,7 @@ from dynmap_rl.envs.tasks import (
     BinDropping,
     get_task,
 )
+from dynmap_rl.envs.world import FINAL_STEPS
 
 CAUSES = (
     "drops at the start", "drops while accelerating", "drops while braking", "drops at the goal",
@@ -25,8 +26,6 @@ CAUSES = (
     "keeps the block", "drops beside the bin", "in the bin, but touched or moving",
     "loses the object", "hardly moves the object", "ends above or below the goal", "other",
 )  # fmt: skip
-NEAR = SUCCESS_DISTANCE  # m, from start or goal
-LAST = 10  # steps, over which the position error is a mean
 MOVED = 0.01  # m
 
 
@@ -88,9 +87,9 @@ def _drop_cause(episode: TensorDictBase, step: int) -> str:
     upright = np.flatnonzero(np.abs(position[: step + 1, 5] - position[: step + 1, 2]) <= ROCKING)
     begin = int(upright[-1]) if len(upright) else 0
     place = position[begin, :2]
-    if np.linalg.norm(place - episode["goal"][0].numpy()) < NEAR:
+    if np.linalg.norm(place - episode["goal"][0].numpy()) < SUCCESS_DISTANCE:
         return "drops at the goal"
-    if np.linalg.norm(place - position[0, :2]) < NEAR:
+    if np.linalg.norm(place - position[0, :2]) < SUCCESS_DISTANCE:
         return "drops at the start"
     around = slice(max(begin - 1, 0), begin + 2)
     power = (velocity[around, :2] * acceleration[around, :2]).sum()
@@ -99,9 +98,9 @@ def _drop_cause(episode: TensorDictBase, step: int) -> str:
 
 def _miss_cause(episode: TensorDictBase) -> str:
     position, velocity = (episode["dynamics", name][:, :2].numpy() for name in ("position", "velocity"))
-    if np.linalg.norm(velocity[-LAST:], axis=1).mean() > REST_SPEED:
+    if np.linalg.norm(velocity[-FINAL_STEPS:], axis=1).mean() > REST_SPEED:
         return "still moves at the end"
-    return _place(position[0], position[-LAST:].mean(0), episode["goal"][0].numpy())
+    return _place(position[0], position[-FINAL_STEPS:].mean(0), episode["goal"][0].numpy())
 
 
 def _place(start: np.ndarray, end: np.ndarray, goal: np.ndarray) -> str:

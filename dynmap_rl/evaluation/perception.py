@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import batched
 
 import numpy as np
 import torch
@@ -10,7 +11,7 @@ from tensordict import TensorDictBase
 
 from dynmap_rl.data.features import compute_features
 from dynmap_rl.data.recording.plans import Plan, roll_out
-from dynmap_rl.envs.scene import GOAL_COLOR, Scene, scene_seed
+from dynmap_rl.envs.scene import GOAL_COLOR, Scene, scene_seeds
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.experts.network import list_checkpoints
 from dynmap_rl.modules.world_model import WorldModel
@@ -39,7 +40,7 @@ def color_errors(
     names = "object", "object_truth", "goal", "goal_truth", "blank"
     found: dict[str, list[torch.Tensor]] = {name: [] for name in names}
     rest, pixels = 0.0, 0
-    for chunk, some in zip(episodes.split(batch), _split(scenes, batch), strict=True):
+    for chunk, some in zip(episodes.split(batch), batched(scenes, batch), strict=True):
         chunk = chunk.to(device)
         latent = world_model.encode(chunk["pixels"], mixed=True)
         states = world_model.predict(latent, chunk["action"])
@@ -102,14 +103,10 @@ def begin_scenes(task: str, count: int, steps: int = 11) -> tuple[TensorDictBase
         Episodes ``[count, steps]`` and their scenes.
     """
     checkpoint = list_checkpoints(task)[-1]
-    plans = [Plan(seed, checkpoint) for seed in (scene_seed("validation", i) for i in range(count))]
+    plans = [Plan(seed, checkpoint) for seed in scene_seeds("validation", count)]
     rules = get_task(task)
     scenes = [rules.sample_scene(np.random.default_rng(plan.scene_seed)) for plan in plans]
     return roll_out(task, plans)[:, :steps], scenes
-
-
-def _split(scenes: Sequence[Scene], size: int) -> list[Sequence[Scene]]:
-    return [scenes[i : i + size] for i in range(0, len(scenes), size)]
 
 
 def _explained(values: torch.Tensor, truth: torch.Tensor, guess: torch.Tensor) -> float:

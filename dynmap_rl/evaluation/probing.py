@@ -7,9 +7,9 @@ from tensordict import TensorDictBase
 
 from dynmap_rl.data.features import compute_features
 from dynmap_rl.keys import DYNAMICS
+from dynmap_rl.modules.actor import STATES
 from dynmap_rl.modules.world_model import WorldModel
 
-STATES = "latent", "hidden1", "hidden2"
 GOOD = 0.75  # R^2 of the velocities
 
 

@@ -12,13 +12,14 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from dynmap_rl.envs.delay import FrameDelay
+from dynmap_rl.envs.scene import scene_seeds
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.modules.actor import Actor
 from dynmap_rl.modules.world_model import WorldModel
 from dynmap_rl.utils.processes import map_processes
 
 from .failures import failure_causes
-from .rollout import episode_rows, find_device, roll_out, scene_seeds
+from .rollout import episode_rows, find_device, roll_out
 from .settings import SHARED_STARTS, Evaluation
 from .statistics import summarize
 

@@ -15,7 +15,6 @@ from tqdm import tqdm
 from dynmap_rl.data.recording.plans import Plan, draw_pushes, push
 from dynmap_rl.envs.delay import FrameDelay
 from dynmap_rl.envs.delay_transform import DelayTransform
-from dynmap_rl.envs.scene import scene_seed
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.modules.delayed_actor import DelayedActor
@@ -23,11 +22,6 @@ from dynmap_rl.modules.delayed_actor import DelayedActor
 from .still import reuse_still_frames
 
 EVENTS = tuple(("next", key) for key in ("position_error", "dropped", "touched", "is_success"))
-
-
-def scene_seeds(split: str, count: int, start: int = 0) -> list[int]:
-    """Return the seeds of the scenes ``start`` to ``start + count - 1`` of a split."""
-    return [scene_seed(split, start + i) for i in range(count)]
 
 
 @torch.no_grad()

@@ -118,7 +118,7 @@ class LatentActor(TensorDictModuleBase):
             state = _recall(tensordict, sizes, self.is_init, latent.device)
         action, state = self.policy.step(latent, hidden1, hidden2, tensordict[self.goal], state)
         tensordict.set(self.action, action)
-        _remember(tensordict, self.policy_memory, state or ())
+        remember(tensordict, self.policy_memory, state or ())
         return tensordict
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
@@ -209,7 +209,7 @@ class Actor(TensorDictModuleBase):
         """Write the predicted latent and the world model's memory of the next step, from ``latent`` and ``action``."""
         state = self._recall(tensordict)
         predicted, state = self.world_model.step(tensordict[self.latent], tensordict[self.action], state)
-        _remember(tensordict, (self.predicted_latent, *self.memory), (predicted, *state))
+        remember(tensordict, (self.predicted_latent, *self.memory), (predicted, *state))
         return tensordict
 
     def _recall(self, tensordict: TensorDictBase) -> tuple[torch.Tensor, ...]:
@@ -232,7 +232,8 @@ def _recall(tensordict: TensorDictBase, sizes: dict, is_init: NestedKey, device)
     return state if begins is None else tuple(s.masked_fill(begins, 0.0) for s in state)
 
 
-def _remember(tensordict: TensorDictBase, keys, values) -> None:
+def remember(tensordict: TensorDictBase, keys, values) -> None:
+    """Write values under ``next``."""
     for key, value in zip(keys, values, strict=True):
         tensordict.set(unravel_key(("next", key)), value)
 

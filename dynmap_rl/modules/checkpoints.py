@@ -13,7 +13,7 @@ from .normalization import Normalizer
 from .policy import FeedforwardPolicy, RecurrentPolicy
 from .world_model import WorldModel
 
-POLICIES = {"feedforward": FeedforwardPolicy, "recurrent": RecurrentPolicy}
+POLICIES = {policy.kind: policy for policy in (FeedforwardPolicy, RecurrentPolicy)}
 
 
 def make_world_model(
@@ -112,9 +112,8 @@ def save_policy(folder: Path, policy: FeedforwardPolicy | RecurrentPolicy, world
         policy: policy to save.
         world_model: world model whose states the policy reads.
     """
-    recurrent = isinstance(policy, RecurrentPolicy)
     arguments = {
-        "kind": "recurrent" if recurrent else "feedforward",
+        "kind": policy.kind,
         "latent_size": world_model.latent_size,
         "hidden_size": world_model.hidden_size,
         "action": policy.action.size,

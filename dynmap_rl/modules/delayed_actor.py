@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey, unravel_key
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import TensorDictPrimer
 
-from .actor import MEMORY, Actor
+from .actor import MEMORY, Actor, remember
 from .world_model import WorldModel
 
 BASE = ("predicted_latent", *MEMORY)  # state of the world model before the oldest step that is remembered
@@ -119,10 +119,7 @@ class DelayedActor(TensorDictModuleBase):
         history["action"][..., -1, :] = action
         memory = tuple(tensordict[key] for key in self.actor.memory)
         predicted, memory = self.world_model.step(tensordict[self.actor.latent], action, memory)
-        for key, value in zip(
-            (self.actor.predicted_latent, *self.actor.memory), (predicted, *memory), strict=True
-        ):
-            tensordict.set(unravel_key(("next", key)), value)
+        remember(tensordict, (self.actor.predicted_latent, *self.actor.memory), (predicted, *memory))
         base = self._advance(history, 0, tuple(history[name] for name in BASE))
         history.update(dict(zip(BASE, base, strict=True)))
         for name in ("latent", "action", "arrived"):

@@ -20,6 +20,8 @@ class FeedforwardPolicy(nn.Module):
         width: width of the hidden layers.
     """
 
+    kind = "feedforward"
+
     def __init__(
         self,
         latent_size: int,
@@ -62,6 +64,8 @@ class RecurrentPolicy(nn.Module):
         goal: normaliser of the goals; its size is G.
         width: hidden size of the policy's cells.
     """
+
+    kind = "recurrent"
 
     def __init__(
         self,

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 from dynmap_rl.evaluation.statistics import rate_gap, welch_interval
 
-from .cells import Key
+from .cells import TASKS, Key
 from .results import ROWS, Cell
 from .tables import join_table
 
-ONE, TWO, THREE = "balance_reaching", "balance_reaching_obstacle", "bin_dropping"
+ONE, TWO, THREE = TASKS
 DYNAMICS_ROWS = [row for row in ROWS if row.startswith("RGB+")]
 HOLDS, FAILED, OPEN = VERDICTS = "holds", "does not hold", "open"
 

@@ -98,7 +98,10 @@ def paper_numbers(result: dict) -> dict[str, tuple[float, float]] | None:
     column = (
         "decoupled" if source["training"] == "decoupled" else "joint"
     )  # the latter has the row End-to-End
-    table = TABLES.get((result["task"], column, result["policy"]), {})
-    if result["row"] not in table:
-        return None
-    return dict(zip(METRICS[result["task"]], table[result["row"]], strict=True))
+    return find_numbers(result["task"], column, result["policy"], result["row"])
+
+
+def find_numbers(task: str, training: str, policy: str, row: str) -> dict[str, tuple[float, float]] | None:
+    """Return the paper's mean and standard deviation of each metric of a cell; None where it has no such cell."""
+    numbers = TABLES.get((task, training, policy), {}).get(row)
+    return numbers and dict(zip(METRICS[task], numbers, strict=True))

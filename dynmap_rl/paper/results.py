@@ -15,7 +15,7 @@ from dynmap_rl.evaluation.statistics import shared_interval, student_interval, s
 from dynmap_rl.utils.files import read_json
 
 from .cells import Key, Run, list_runs
-from .published import METRICS, TABLES
+from .published import TABLES, find_numbers
 
 ROWS = list(TABLES["bin_dropping", "joint", "recurrent"])  # in the paper's order, End-to-End first
 COLUMNS = {  # table: its columns, as (task, training, policy)
@@ -96,9 +96,7 @@ class Cell:
     @property
     def published(self) -> dict[str, tuple[float, float]] | None:
         """The paper's mean and standard deviation of each metric; None where the paper has no such cell."""
-        *column, row = self.key
-        numbers = TABLES.get(tuple(column), {}).get(row)
-        return numbers and dict(zip(METRICS[self.key[0]], numbers, strict=True))
+        return find_numbers(*self.key)
 
 
 def read_cells(results: Path, tables: Iterable[str] = tuple(COLUMNS)) -> dict[Key, Cell]:

@@ -14,9 +14,8 @@ from dynmap_rl.envs.protocol import Layout
 from dynmap_rl.envs.task import LAYOUT
 from dynmap_rl.envs.tasks import REST_SPEED
 from dynmap_rl.envs.world import CONTROL_DT
-from dynmap_rl.evaluation.probing import STATES
 from dynmap_rl.keys import DYNAMICS
-from dynmap_rl.modules.actor import make_world_model_module
+from dynmap_rl.modules.actor import STATES, make_world_model_module
 from dynmap_rl.modules.world_model import WorldModel
 
 matplotlib.use("Agg")

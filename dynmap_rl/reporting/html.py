@@ -5,10 +5,9 @@ from __future__ import annotations
 import base64
 import html
 import io
-from collections.abc import Iterator
 from pathlib import Path
 
-from dynmap_rl.runs.folder import read_metrics
+from dynmap_rl.runs.folder import flatten, read_metrics
 from dynmap_rl.utils.files import read_json, write_bytes
 
 STYLE = """
@@ -65,7 +64,7 @@ def write_html(
     settings = read_json(folder / "config.json") if settings is None else settings
     cells = "".join(
         f"<tr><td>{html.escape(name)}</td><td>{html.escape(str(value))}</td></tr>"
-        for name, value in _flatten(settings)
+        for name, value in flatten(settings).items()
     )
     parts += ["<h2>Settings</h2>", f"<table>{cells}</table>"]
     parts += [f"<pre>{html.escape(command)}</pre>"] if command else []
@@ -75,15 +74,6 @@ def write_html(
     )
     write_bytes(folder / "report.html", page.encode())
     return folder / "report.html"
-
-
-def _flatten(settings: dict, prefix: str = "") -> Iterator[tuple[str, object]]:
-    """Yield the entries of nested settings with dotted names, such as ``world_model.updates``."""
-    for name, value in settings.items():
-        if isinstance(value, dict):
-            yield from _flatten(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value
 
 
 def draw_curves(curves: dict[str, list[dict]], columns: int = 3) -> str:

@@ -51,7 +51,7 @@ def _open(folder: Path, config, ignore: tuple[str, ...]) -> Path:
         raise ValueError(
             f"{folder} holds a run of another release, which cannot resume here; choose another --run"
         )
-    flat = (_flatten(s).items() for s in (stored, settings))
+    flat = (flatten(s).items() for s in (stored, settings))
     old, new = ({k: v for k, v in s if not {k, k.partition(".")[0]} & set(ignore)} for s in flat)
     if changed := sorted(k for k in {*old, *new} if old.get(k) != new.get(k)):
         detail = ", ".join(f"{k}: {old.get(k)} there, {new.get(k)} here" for k in changed)
@@ -66,10 +66,11 @@ def plain_settings(config) -> dict:
     return json.loads(json.dumps(dataclasses.asdict(config), default=str))
 
 
-def _flatten(settings: dict, prefix: str = "") -> dict:
+def flatten(settings: dict, prefix: str = "") -> dict:
+    """Return nested settings with dotted names, such as ``world_model.updates``."""
     flat = {}
     for name, value in settings.items():
-        flat |= _flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+        flat |= flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
     return flat
 
 

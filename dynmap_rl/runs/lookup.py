@@ -40,6 +40,11 @@ def find_run(run: str | Path) -> Path:
         raise ValueError(f"no run at {run}, neither as a folder nor on the hub ({reason})") from error
 
 
+def has_world_model(folder: Path) -> bool:
+    """Return whether a folder is a run, and not a LeRobot policy."""
+    return (folder / "world_model").exists() or any(folder.glob("seed_*"))
+
+
 def load_actor(run: str | Path, seed: int = 0) -> Actor:
     """Load world model and policy of a run, in evaluation mode and in the precision of the recipes' evaluation.
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import torch
 from tensordict import TensorDict
@@ -13,7 +11,7 @@ from torchrl.envs.utils import step_mdp
 from tqdm import tqdm
 
 from dynmap_rl.data.features import compute_features
-from dynmap_rl.envs.scene import scene_seed
+from dynmap_rl.envs.scene import scene_seeds
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.envs.world import EPISODE_STEPS, limit_actions
 from dynmap_rl.experts.network import list_checkpoints, load_expert, task_of_expert
@@ -26,16 +24,13 @@ FIRST_SCENE = 1_000_000  # far from the scenes of demonstrations
 
 
 @torch.no_grad()
-def collect_corrections(
-    actor: TensorDictModuleBase, task: str, seeds: list[int], expert: str | Path | None = None
-) -> TensorDict:
+def collect_corrections(actor: TensorDictModuleBase, task: str, seeds: list[int]) -> TensorDict:
     """Let a student act in scenes, and record what the expert would have done in every state that it reaches.
 
     Args:
         actor: the student, such as :class:`dynmap_rl.modules.Actor`.
         task: name of the task.
         seeds: seeds of the scenes.
-        expert: folder or task of the expert's checkpoints; by default the expert that ships for the task.
 
     Returns:
         Episodes ``[E, 120]`` with ``pixels``, ``goal``, ``dynamics``, the student's ``action`` as executed,
@@ -43,7 +38,7 @@ def collect_corrections(
     """
     actor, device, count = actor.eval(), next(actor.parameters()).device, len(seeds)
     env = DynmapBatchedEnv(task, count, from_pixels=True, device=device)
-    network, rules = load_expert(expert or task), task_of_expert(expert or task, env.task)
+    network, rules = load_expert(task), task_of_expert(task, env.task)
     td = env.reset(TensorDict({"scene_seed": torch.tensor(seeds)}, [count]))
     steps = []
     for _ in tqdm(range(EPISODE_STEPS), f"corrections in {count} scenes", unit="step", leave=False):
@@ -87,7 +82,7 @@ def add_corrections(
         scenes: number of scenes.
         seed: chooses the scenes.
     """
-    seeds = [scene_seed("train", FIRST_SCENE + seed * scenes + i) for i in range(scenes)]
+    seeds = scene_seeds("train", scenes, start=FIRST_SCENE + seed * scenes)
     corrections = collect_corrections(Actor(world_model, policy, mixed=True), task, seeds)
     states = compute_features(world_model, corrections).to(features.device)
     states["disturbed"] |= corrections["failed"].to(states.device)

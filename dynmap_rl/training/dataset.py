@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from dynmap_rl.data.demonstrations import META, find_layout, find_meta
@@ -31,8 +32,13 @@ def find_or_record(task: str, dataset: str | Path | None = None) -> str | Path:
     return dataset
 
 
-def choose_augmentation(task: BaseTask, augmentation: Augmentation) -> Augmentation:
-    """Return the augmentation for windows of a task: none where frames are no flat pictures of the plane."""
+def choose_augmentation(task: BaseTask, augmentation: Augmentation, imitated: bool = False) -> Augmentation:
+    """Return the augmentation for windows of a task: none where frames are no flat pictures of the plane.
+
+    Where a policy learns from the windows too (``imitated``), they are mirrored and shifted in symmetric tasks only.
+    """
+    if imitated and not task.symmetric:
+        augmentation = replace(augmentation, mirror=False, max_shift=0)
     return augmentation if task.planar else Augmentation.off()
 
 

@@ -186,16 +186,25 @@ def refuse(settings, default, names: Sequence[str], other: str, prefix: str = ""
             raise ValueError(f"--{prefix}{name} has no effect with {other}; leave it out")
 
 
+def parse_numbers(text: str, option: str) -> list[int]:
+    """Parse numbers such as ``0,1,2``.
+
+    Raises:
+        ValueError: an entry is no whole number.
+    """
+    try:
+        return [int(number) for number in text.split(",")]
+    except ValueError as error:
+        raise ValueError(f"{option} must be whole numbers such as 0,1,2, got {text!r}") from error
+
+
 def parse_seeds(text: str) -> list[int]:
     """Parse seeds such as ``0,1,2``.
 
     Raises:
         ValueError: an entry is no whole number, or occurs twice.
     """
-    try:
-        seeds = [int(seed) for seed in text.split(",")]
-    except ValueError as error:
-        raise ValueError(f"--seeds must be whole numbers such as 0,1,2, got {text!r}") from error
+    seeds = parse_numbers(text, "--seeds")
     if len(set(seeds)) < len(seeds):
         raise ValueError(f"--seeds must be different numbers, got {text}")
     return seeds

@@ -24,18 +24,14 @@ def connect() -> None:
         ray.init(log_to_driver=False, logging_level="ERROR")
 
 
-def run_by_ray(
-    function: Callable, arguments: Sequence, cpus: float = 1, gpus: float = 0
-) -> Iterator[tuple[object, Callable]]:
-    """Call a function on Ray's workers, in the order in which they end.
+def run_by_ray(function: Callable, arguments: Sequence) -> Iterator[tuple[object, Callable]]:
+    """Call a function on Ray's workers, a CPU each, in the order in which they end.
 
     Without a cluster, Ray starts one on this machine. Folders of the arguments must be shared by its machines.
 
     Args:
         function: function of one argument.
         arguments: what the function is called with.
-        cpus: CPUs of a call.
-        gpus: GPUs of a call.
 
     Yields:
         The argument, and a function that returns the value, or raises what the call raised or ``OSError`` where its
@@ -44,8 +40,8 @@ def run_by_ray(
     import ray
 
     connect()
-    remote = ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=0)(_call)
-    running = {remote.remote(function, one): one for one in arguments}
+    remote = ray.remote(num_cpus=1, max_retries=0)(function)
+    running = {remote.remote(one): one for one in arguments}
     try:
         while running:
             (done,), _ = ray.wait(list(running))
@@ -69,7 +65,3 @@ def _get(reference):
 def lost(error: Exception) -> OSError:
     """Return the error of a worker that Ray lost."""
     return OSError(f"a worker was lost by Ray ({type(error).__name__}); the same command resumes")
-
-
-def _call(function: Callable, argument):
-    return function(argument)

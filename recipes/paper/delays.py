@@ -63,7 +63,7 @@ def main(config: Config) -> None:
     import torch
 
     from dynmap_rl.paper.delays import CONDITIONS, DELAYS, frame_delay
-    from dynmap_rl.runs.lookup import find_run
+    from dynmap_rl.runs.lookup import find_run, has_world_model
 
     recipe, baseline = "recipes/paper/delays.py", PolicyTraining(kind="feedforward")
     refuse(config.eval, Evaluation(paper_episodes=0), ["paper_episodes"], recipe, "eval.")
@@ -119,16 +119,11 @@ def open_result(config: Config, run: str, condition: str) -> tuple[Path, dict]:
     return path, result
 
 
-def has_world_model(folder: Path) -> bool:
-    """Return whether a folder is a run of ours, and not a LeRobot policy."""
-    return (folder / "world_model").exists() or any(folder.glob("seed_*"))
-
-
 def evaluate_cell(config: Config, path: Path, result: dict, steps: int) -> None:
     """Evaluate a run under a condition with one delay, and add the cell to the file."""
     from dynmap_rl.evaluation.protocol import evaluate
     from dynmap_rl.paper.delays import CONDITIONS, find_training, frame_delay
-    from dynmap_rl.runs.lookup import find_run
+    from dynmap_rl.runs.lookup import find_run, has_world_model
     from dynmap_rl.utils.files import write_json
     from dynmap_rl.utils.version import find_commit
 
@@ -148,9 +143,8 @@ def evaluate_cell(config: Config, path: Path, result: dict, steps: int) -> None:
 def load_actor(config: Config, result: dict, delay) -> tuple:
     """Return the actor of a result, which bridges a delay where one is given, and the names of its row and policy."""
     from dynmap_rl.modules.delayed_actor import DelayedActor
-    from dynmap_rl.modules.policy import RecurrentPolicy
     from dynmap_rl.modules.supervision import row_name
-    from dynmap_rl.runs.lookup import find_run, load_actor
+    from dynmap_rl.runs.lookup import find_run, has_world_model, load_actor
     from dynmap_rl.training.dataset import find_or_record
     from dynmap_rl.utils.devices import choose_device
 
@@ -161,8 +155,7 @@ def load_actor(config: Config, result: dict, delay) -> tuple:
         actor = LeRobotActor(folder, cut=delay is not None)
         return actor, {"row": actor.policy.config.type, "policy": "LeRobot"}
     actor = load_actor(folder, config.seed).to(choose_device(config.compute.device))
-    kind = "recurrent" if isinstance(actor.policy, RecurrentPolicy) else "feedforward"
-    names = {"row": row_name(actor.world_model.supervision), "policy": kind}
+    names = {"row": row_name(actor.world_model.supervision), "policy": actor.policy.kind}
     if result["condition"] == "past_actions":
         names["policy"] = "feedforward"
         dataset = find_or_record(result["task"], config.dataset)

@@ -52,8 +52,7 @@ def main(config: Config) -> None:
     names = [name.strip() for name in config.only.split(",")] if config.only else list(FIGURES)
     if unknown := sorted(set(names) - set(FIGURES)):
         raise ValueError(f"--only must be any of {', '.join(FIGURES)}, got {', '.join(unknown)}")
-    datasets = name_datasets(config)
-    drawn, missing = [], []
+    datasets, drawn, missing = name_datasets(config), [], []
     for name in names:
         try:
             FIGURES[name][0](config, datasets)
@@ -156,7 +155,8 @@ def draw_fig7(config: Config, datasets: dict) -> None:
 
 def draw_fig8(config: Config, datasets: dict) -> None:
     """Draw position errors of the first policy seed by the paper's protocol."""
-    from dynmap_rl.evaluation.rollout import roll_out, scene_seeds
+    from dynmap_rl.envs.scene import scene_seeds
+    from dynmap_rl.evaluation.rollout import roll_out
     from dynmap_rl.evaluation.settings import SHARED_STARTS
     from dynmap_rl.paper.figures import plot_position_errors
     from dynmap_rl.runs.lookup import load_actor

@@ -9,8 +9,9 @@ from torch import nn
 
 import dynmap_rl  # noqa: F401  (registers the ids)
 from dynmap_rl.data import load_dataset, load_meta, sample_windows
+from dynmap_rl.envs.scene import scene_seeds
 from dynmap_rl.envs.world import EPISODE_STEPS
-from dynmap_rl.evaluation.rollout import roll_out, scene_seeds
+from dynmap_rl.evaluation.rollout import roll_out
 from dynmap_rl.modules.actor import Actor
 from dynmap_rl.modules.checkpoints import make_policy, make_world_model
 from dynmap_rl.modules.precision import mixed_precision

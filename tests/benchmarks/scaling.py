@@ -15,8 +15,9 @@ import torch
 from timing import seconds
 
 from dynmap_rl.data import load_dataset, load_meta, record_dataset
+from dynmap_rl.envs.scene import scene_seeds
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
-from dynmap_rl.evaluation.rollout import roll_out, scene_seeds
+from dynmap_rl.evaluation.rollout import roll_out
 from dynmap_rl.modules.actor import Actor
 from dynmap_rl.modules.checkpoints import make_policy, make_world_model
 from dynmap_rl.utils.files import write_json

@@ -4,8 +4,8 @@ from types import SimpleNamespace
 
 import pytest
 
+from dynmap_rl.envs.scene import scene_seeds
 from dynmap_rl.evaluation.experts import fresh_scenes, rates, rates_text
-from dynmap_rl.evaluation.rollout import scene_seeds
 
 
 def test_rates_are_means_over_worlds():

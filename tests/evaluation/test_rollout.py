@@ -7,10 +7,11 @@ from tensordict.nn import TensorDictModule
 
 from dynmap_rl.envs.delay import FrameDelay
 from dynmap_rl.envs.renderer import Renderer
+from dynmap_rl.envs.scene import scene_seeds
 from dynmap_rl.envs.tasks import TASKS, get_task
 from dynmap_rl.envs.world import EPISODE_STEPS
 from dynmap_rl.evaluation.protocol import evaluate, judge_in_closed_loop, pack_rows, unpack_rows
-from dynmap_rl.evaluation.rollout import episode_rows, failures_first, roll_out, scene_seeds
+from dynmap_rl.evaluation.rollout import episode_rows, failures_first, roll_out
 from dynmap_rl.evaluation.settings import Evaluation
 from dynmap_rl.modules.actor import Actor
 from dynmap_rl.modules.checkpoints import make_policy, make_world_model

@@ -4,10 +4,10 @@ import pytest
 import torch
 from torch import nn
 
+from dynmap_rl.envs.scene import scene_seeds
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.world import ACCELERATION_LIMIT
 from dynmap_rl.evaluation.experts import list_outcomes
-from dynmap_rl.evaluation.rollout import scene_seeds
 from dynmap_rl.experts.careless import CarelessController
 from dynmap_rl.experts.network import roll_out
 

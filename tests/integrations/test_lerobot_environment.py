@@ -9,8 +9,8 @@ from tensordict import TensorDict
 from torch import nn
 
 from dynmap_rl.data.demonstrations import load_dataset, load_meta
+from dynmap_rl.envs.scene import scene_seeds
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
-from dynmap_rl.evaluation.rollout import scene_seeds
 from dynmap_rl.integrations.lerobot.environment import DynmapEnvConfig
 from dynmap_rl.keys import GYMNASIUM_IDS
 

@@ -6,8 +6,8 @@ import torch
 from small import CONSTANTS
 from tensordict import TensorDict
 
+from dynmap_rl.envs.scene import scene_seeds
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
-from dynmap_rl.evaluation.rollout import scene_seeds
 from dynmap_rl.integrations.onnx import PARTS, OnnxActor, export_to_onnx
 from dynmap_rl.modules.checkpoints import make_policy, make_world_model, save_policy, save_world_model
 from dynmap_rl.runs.lookup import load_actor

@@ -5,8 +5,8 @@ import pytest
 import torch
 from made_up import make_rows
 
+from dynmap_rl.envs.scene import scene_seeds
 from dynmap_rl.evaluation.failures import CAUSES
-from dynmap_rl.evaluation.rollout import scene_seeds
 from dynmap_rl.modules.checkpoints import make_policy, make_world_model, save_policy, save_world_model
 from dynmap_rl.paper import failures
 from dynmap_rl.paper.cells import list_runs

@@ -6,7 +6,8 @@ from small import CONSTANTS, make_model
 from tensordict import TensorDict
 
 from dynmap_rl.envs.delay import FrameDelay
-from dynmap_rl.evaluation.rollout import roll_out, scene_seeds
+from dynmap_rl.envs.scene import scene_seeds
+from dynmap_rl.evaluation.rollout import roll_out
 from dynmap_rl.modules.normalization import Normalizer
 from dynmap_rl.paper.past_actions import PastActionsActor, PastActionsPolicy, train_past_actions
 from dynmap_rl.training.settings import PolicyTraining

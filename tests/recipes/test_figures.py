@@ -7,7 +7,7 @@ from made_up import make_rows
 from PIL import Image
 
 from dynmap_rl.data.demonstrations import load_meta
-from dynmap_rl.evaluation.rollout import scene_seeds
+from dynmap_rl.envs.scene import scene_seeds
 from dynmap_rl.modules.checkpoints import make_policy, make_world_model, save_policy, save_world_model
 from dynmap_rl.paper.cells import list_runs
 from dynmap_rl.paper.figures import loss_panels
@@ -51,7 +51,7 @@ def runs(recording, tmp_path_factory):
 def few_episodes(monkeypatch):
     """Four closed-loop episodes in the place of fifty."""
     monkeypatch.setattr(
-        "dynmap_rl.evaluation.rollout.scene_seeds", lambda split, count, start: scene_seeds(split, 4, start)
+        "dynmap_rl.envs.scene.scene_seeds", lambda split, count, start: scene_seeds(split, 4, start)
     )
 
 

@@ -8,7 +8,8 @@ from dynmap_rl.data.augmentation import augment
 from dynmap_rl.data.demonstrations import load_dataset, load_meta
 from dynmap_rl.data.features import compute_features
 from dynmap_rl.data.windows import sample_windows
-from dynmap_rl.evaluation.rollout import roll_out, scene_seeds
+from dynmap_rl.envs.scene import scene_seeds
+from dynmap_rl.evaluation.rollout import roll_out
 from dynmap_rl.modules.actor import Actor
 from dynmap_rl.modules.checkpoints import make_policy, make_world_model
 from dynmap_rl.modules.precision import mixed_precision

@@ -110,7 +110,7 @@ def _write_episodes(
     old = tuple(f"stats/{name}/" for name in values)
     rows = rows.drop_columns([name for name in rows.column_names if name.startswith(old)])
     for name, numbers in values.items():
-        stats = [_compute_stats(numbers[rows_of[e]]) for e in rows["episode_index"].to_pylist()]
+        stats = [compute_stats(numbers[rows_of[e]]) for e in rows["episode_index"].to_pylist()]
         for key in stats[0]:
             rows = rows.append_column(f"stats/{name}/{key}", pa.array([s[key].tolist() for s in stats]))
     pq.write_table(rows, target)
@@ -119,11 +119,12 @@ def _write_episodes(
 def _write_stats(path: Path, values: dict[str, np.ndarray]) -> None:
     stats = read_json(path) if path.exists() else {}
     for name, numbers in values.items():
-        stats[name] = {key: value.tolist() for key, value in _compute_stats(numbers).items()}
+        stats[name] = {key: value.tolist() for key, value in compute_stats(numbers).items()}
     path.write_text(json.dumps(stats, indent=4))
 
 
-def _compute_stats(numbers: np.ndarray) -> dict[str, np.ndarray]:
+def compute_stats(numbers: np.ndarray) -> dict[str, np.ndarray]:
+    """Return LeRobot's statistics of numbers ``[N, D]``."""
     from lerobot.datasets.compute_stats import get_feature_stats
 
     # float32 is not enough for variances.

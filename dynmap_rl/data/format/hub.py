@@ -79,6 +79,7 @@ def push_dataset(root: str | Path, repo_id: str) -> None:
             f"{root} must be a recording of cart and block, whose card is written here, got {meta['task']}; upload it "
             "with LeRobotDataset.push_to_hub"
         )
+    derived = read_json(path) if (path := Path(root) / DERIVED).exists() else None
     with quiet():
         from huggingface_hub import HfApi
         from lerobot.datasets import LeRobotDataset
@@ -95,7 +96,7 @@ def push_dataset(root: str | Path, repo_id: str) -> None:
             dataset.push_to_hub(
                 tags=["dynamics", "world-model", "imitation-learning"],
                 license="mit",
-                dataset_description=_describe(meta, dataset.meta.tasks.index[0], _read_derivation(root)),
+                dataset_description=_describe(meta, dataset.meta.tasks.index[0], derived),
                 paper=PAPER,
                 url="https://github.com/Automation-Research-Team/DynamicsMapping-2D (the paper's)",
                 citation_bibtex=CITATION,
@@ -128,11 +129,6 @@ def draw_episodes(episodes: TensorDict, path: Path, rows: int = 3, columns: int 
 
 
 KINDS = {"human": "Demonstrations of a person", "undisturbed": "Undisturbed demonstrations"}
-
-
-def _read_derivation(root: str | Path) -> dict | None:
-    path = Path(root) / DERIVED
-    return read_json(path) if path.exists() else None
 
 
 def _describe(meta: dict, instruction: str, derived: dict | None) -> str:

@@ -14,6 +14,7 @@ from dynmap_rl.envs.protocol import Layout
 from dynmap_rl.keys import CAMERAS
 
 from ..decoding import decode_episodes
+from .columns import compute_stats
 from .quiet import quiet
 from .reading import read_column, read_info, read_table
 
@@ -153,15 +154,10 @@ def _compute_stats(root: Path, layout: Layout) -> dict[str, dict[str, np.ndarray
     LeRobot's merging averages the quantiles of the episodes. A goal is constant in an episode: all of its quantiles
     would be its mean.
     """
-    from lerobot.datasets.compute_stats import get_feature_stats
-
     info, features = read_info(root), make_features(layout)
     names = [name for name, feature in features.items() if feature["dtype"] != "image"]
     table = read_table(root, info, names)
-    return {
-        name: get_feature_stats(read_column(root, info, table, name).double().numpy(), axis=0, keepdims=False)
-        for name in names
-    }
+    return {name: compute_stats(read_column(root, info, table, name).numpy()) for name in names}
 
 
 @contextlib.contextmanager

@@ -12,7 +12,6 @@ from tensordict import TensorDict
 
 from dynmap_rl.data.demonstrations import find_meta
 from dynmap_rl.data.format.reading import read_column, read_file, read_info
-from dynmap_rl.data.normalization import normalization_constants
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.keys import NEEDED
 
@@ -62,24 +61,6 @@ def read_columns(root: str | Path) -> TensorDict:
     data["index"] = torch.tensor(index)
     data[DISTURBED] = data.get(DISTURBED, torch.zeros(len(table), 1)).bool()
     return TensorDict(data, [len(table)])
-
-
-def find_constants(root: str | Path, columns: TensorDict) -> dict[str, dict[str, list[float]]]:
-    """Return the constants of normalisation of a dataset.
-
-    Args:
-        root: folder of the dataset.
-        columns: its columns ``[N]``, from which the constants are computed where ``meta/dynmap.json`` is missing, as in
-            a dataset that LeRobot's tools have edited (see :func:`dynmap_rl.data.normalization_constants`).
-    """
-    meta = find_meta(Path(root))
-    return meta["normalization"] if meta else normalization_constants(columns[None])
-
-
-def find_task(root: str | Path) -> str | None:
-    """Return the task of a recording; None where ``meta/dynmap.json`` is missing."""
-    meta = find_meta(Path(root))
-    return meta["task"] if meta else None
 
 
 def is_symmetric(task: str | None) -> bool:

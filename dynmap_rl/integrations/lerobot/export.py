@@ -9,7 +9,6 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 
 from dynmap_rl.keys import CAMERA, FRAME_SHAPE
 from dynmap_rl.modules.checkpoints import save_policy, save_world_model
-from dynmap_rl.modules.policy import RecurrentPolicy
 from dynmap_rl.runs.lookup import find_run, load_actor
 from dynmap_rl.utils.files import read_json, write_json
 
@@ -45,7 +44,7 @@ def export_to_lerobot(run: str | Path, folder: str | Path, seed: int = 0) -> Pat
         task=settings.get("task"),
         source=results.get("world_model"),
         supervision=",".join(world_model.supervision) or "none",
-        kind="recurrent" if isinstance(policy, RecurrentPolicy) else "feedforward",
+        kind=policy.kind,
         latent_size=world_model.latent_size,
         hidden_size=world_model.hidden_size,
         architecture=world_model.architecture,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
+from pathlib import Path
 
 import torch
 from lerobot.policies import PreTrainedPolicy
@@ -10,6 +11,8 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from tensordict import TensorDict
 
 from dynmap_rl.data.augmentation import augment
+from dynmap_rl.data.demonstrations import find_meta
+from dynmap_rl.data.normalization import normalization_constants
 from dynmap_rl.keys import DYNAMICS
 from dynmap_rl.modules.actor import Actor
 from dynmap_rl.modules.checkpoints import make_policy, make_world_model
@@ -20,7 +23,7 @@ from dynmap_rl.modules.supervision import parse_supervision
 from dynmap_rl.objectives.joint import JointLoss
 from dynmap_rl.objectives.world_model import WorldModelLoss
 
-from .columns import find_constants, find_task, is_symmetric, read_columns
+from .columns import is_symmetric, read_columns
 from .configuration_dynmap import GOAL, DynmapConfig
 
 
@@ -48,14 +51,15 @@ class DynmapPolicy(PreTrainedPolicy):
         constants = {name: {"low": [-1.0] * n, "high": [1.0] * n} for name, n in config.sizes.items()}
         self.trainable, self.symmetric = dataset_meta is not None, bool(config.symmetric)
         if dataset_meta is not None:
-            columns = read_columns(dataset_meta.root)
-            constants = find_constants(dataset_meta.root, columns)
+            columns, meta = read_columns(dataset_meta.root), find_meta(Path(dataset_meta.root))
+            # A dataset that LeRobot's tools have edited has no metadata.
+            constants = meta["normalization"] if meta else normalization_constants(columns[None])
             config.sizes = {name: len(constants[name]["low"]) for name in config.sizes}
             if config.sizes["goal"] != GOAL:
                 raise ValueError(
                     f"{dataset_meta.root} must have a goal of {GOAL} entries (x, y), got {config.sizes['goal']}"
                 )
-            task = find_task(dataset_meta.root)
+            task = meta["task"] if meta else None
             if config.symmetric is None:
                 self.symmetric = is_symmetric(task)
             config.task = task or config.task
@@ -133,12 +137,10 @@ class DynmapPolicy(PreTrainedPolicy):
         return TensorDict(data, action.shape[:2], device=action.device)
 
     def _augment(self, windows: TensorDict) -> TensorDict:
-        if not self.config.recolor:
-            return windows
         # Seeded by torch's own generator, which LeRobot saves and restores.
         generator = torch.Generator(windows.device).manual_seed(torch.randint(2**62, ()).item())
         limits = {} if self.symmetric else {"max_shift": 0, "mirror": False}
-        return augment(windows, generator, **limits)
+        return augment(windows, generator, recolor=self.config.recolor, **limits)
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, torch.Tensor], **kwargs) -> torch.Tensor:
