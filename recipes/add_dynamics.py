@@ -111,11 +111,16 @@ def main(config: Config) -> None:
     folder = Path("runs/add_dynamics") / config.output.name
     command = command_line(sys.argv)
     differences = {q: difference.tolist() for q, difference in found["differences"].items()}
-    write_json(folder / "quality.json", found["quality"] | {"differences": differences, "command": command})
-    (folder / "tracks.png").unlink(missing_ok=True)  # of another source
-    if config.source.endswith(("tracks", "flow")):
-        plot_tracks(config.dataset, found["view"], worst_episode(found["quality"]), folder / "tracks.png")
-    write_dataset_page(folder, config.output, plain_settings(config), command, text)
+    try:
+        write_json(
+            folder / "quality.json", found["quality"] | {"differences": differences, "command": command}
+        )
+        (folder / "tracks.png").unlink(missing_ok=True)  # of another source
+        if config.source.endswith(("tracks", "flow")):
+            plot_tracks(config.dataset, found["view"], worst_episode(found["quality"]), folder / "tracks.png")
+    except OSError as error:  # the dataset is complete
+        return print(f"no page in {folder}: {error}")
+    return write_dataset_page(folder, config.output, plain_settings(config), command, text)
 
 
 if __name__ == "__main__":

@@ -76,6 +76,10 @@ def main(config: Config) -> None:
             f"--task must differ from the task of --pretrained, got {config.task} for both; choose another --task, or "
             "use recipes/decoupled.py"
         )
+    if world_model.transition.action.size != len(task.layout.action_limit):
+        raise ValueError(
+            f"--pretrained must be of a task with the actions of {config.task}, got {config.pretrained}"
+        )
     name = f"{source['training']}_{'_'.join(world_model.supervision) or 'none'}_{config.policy.kind}"
     folder = config.run or Path("runs/generalize") / task.name / name
     open_run(folder, config, ignore=("run", "cache", "compute", "logger"))

@@ -112,6 +112,8 @@ def load_world_models(runs: list[str]) -> dict:
     models = {}
     for run in runs:
         world_model, source = load_source(run.strip())
+        if world_model.transition.action.size != 3:
+            raise ValueError(f"--runs must be of tasks 1 to 3, got {run}, whose actions are others")
         name = f"{row_name(world_model.supervision, source['training'])}, {source['training']}"
         if world_model.architecture != "glimpse":
             name += f", {world_model.architecture}"

@@ -122,6 +122,11 @@ def check_config(config: Config) -> None:
         raise ValueError("--dataset must be a folder or a hub id; name the dataset to train on")
     if config.method not in ("decoupled", "joint"):
         raise ValueError(f"--method must be decoupled or joint, got {config.method!r}")
+    for part in (config.world_model, config.joint):
+        if part.augmentation.mirror or part.augmentation.max_shift:
+            raise ValueError(
+                "augmentation.mirror and .max_shift must be off: a robot's entries have no known mirror image"
+            )
     if config.image_size < 8 or config.image_size % 8:
         raise ValueError(f"--image_size must be a multiple of 8, got {config.image_size}")
 

@@ -22,8 +22,8 @@ def augment(
     ``state`` hold poses that do not, and are left out.
 
     Args:
-        windows: ``[B, T]`` with ``pixels``, ``action`` ``[B, T, 3]``, ``goal`` ``[B, T, 2]`` and ``dynamics``
-            ``[B, T, D]``: x, y and theta of one body after the other, or x and y of a point, in SI units.
+        windows: ``[B, T]`` with ``pixels`` and, to be mirrored or shifted, ``action`` ``[B, T, 3]``, ``goal`` ``[B, T, 2]``
+            and ``dynamics`` ``[B, T, D]``: x, y and theta of one body after the other, or x and y of a point, in SI units.
         generator: source of the random numbers, on the device of the windows.
         max_shift: largest shift along either axis, in pixels.
         mirror: mirror every other window, on average.
@@ -48,6 +48,8 @@ def augment(
     offset[:, 0, 0] += mirrored  # 1 - x
     windows = windows.exclude("agent_pos", "state")
     windows["pixels"] = _transform_pixels(windows["pixels"], mirrored, shift, channels)
+    if not (mirror or max_shift):
+        return windows
     for key in ("action", "expert_action"):
         if key in windows:
             windows[key] = windows[key] * sign

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from .format.frames import choose_camera, iterate_frames
 from .tracking import SORTS, WIDEST, Tracks, track_centroid, track_objects
 
 BODY = "x", "y", "theta"
+MOST = 250  # objects: their numbers are bytes
 
 
 @dataclass(frozen=True)
@@ -129,14 +131,14 @@ def choose_view(
     objects = len(colors) if colors else objects
     if objects is None:
         objects = len(BODIES) // 3 if planar and source != "centroid" else 1
-    if objects < 1:
-        raise ValueError(f"--objects must be at least 1, got {objects}")
+    if not 1 <= objects <= MOST:
+        raise ValueError(f"--objects must be 1 to {MOST}, got {objects}")
     if not 0 < threshold < 256:
         raise ValueError(f"--threshold must be 1 to 255, got {threshold}")
     if sort not in SORTS:
         raise ValueError(f"--sort must be one of {', '.join(SORTS)}, got {sort!r}")
     width = 1.0 if width is None and planar else width
-    if width is not None and width <= 0:
+    if width is not None and not 0 < width < math.inf:
         raise ValueError(f"--width must be above 0, got {width}")
     column = choose_camera(root, info, camera)
     return Camera(source, column, objects, colors, threshold, sort, point, width)

@@ -98,8 +98,8 @@ def add_dynamics(
     The columns (float32) are computed for one episode at a time, in float64, with the times of the column ``timestamp``.
     The new folder appears when it is complete. Videos are hard-linked where the file system can; all other files are
     copied. A recording of a task stays one, and can be trained on with the recipes of the tasks: its constants of
-    normalisation and the names of its dynamics are written anew. ``meta/dynamics.json`` says how the columns were derived,
-    and has their quality.
+    normalisation and the names of its dynamics are written anew. ``meta/dynamics.json`` has all settings, and
+    the quality of the columns.
 
     Args:
         dataset: local folder or hub id.
@@ -145,7 +145,7 @@ def add_dynamics(
         raise ValueError(f"--source must be one of {', '.join(map(repr, SOURCES))}, got {source!r}")
     _check_method(method or ("central" if source == "state" else "savgol"), window, order)
     planar = meta is not None and _is_planar(meta["task"])
-    parts, view = [], None  # names, motions by episode, and method
+    parts, entries, view = [], None, None  # names, motions by episode, and method
     if "state" in source:
         entries = choose_state(info, state, columns, angles, period, noise, angle_noise, noise_seed)
         parts.append((entries.names, read_state(root, info, entries), method or "central"))
@@ -167,14 +167,14 @@ def add_dynamics(
     rows = dict(spans(table["episode_index"].to_numpy()))
     values, derived, start = {q: np.empty((len(table), len(names))) for q in DYNAMICS}, [], 0
     for own_names, motions, own_method in parts:
-        entries = slice(start, start := start + len(own_names))
+        own = slice(start, start := start + len(own_names))
         for episode, motion in motions:
             try:
                 found, motion = _derive(motion, time[rows[episode]], own_method, window, order)
             except ValueError as error:
                 raise ValueError(f"{root}: episode {episode} {error}") from error
             for quantity, part in found.items():
-                values[quantity][rows[episode], entries] = part
+                values[quantity][rows[episode], own] = part
             derived.append(Derived(episode, own_names, found["position"], found["velocity"], motion))
     new = {f"dynamics.{q}": v.astype(np.float32) for q, v in values.items()}
     meta = _describe(meta, planar, names, values, rows) if meta else None
@@ -185,7 +185,8 @@ def add_dynamics(
     }
     differences = {q: np.abs(values[q] - v).mean(0) for q, v in there.items() if v.shape == values[q].shape}
     quality = judge_quality(derived)
-    how = {"source": source, "method": ",".join(part[2] for part in parts)}
+    how = {"source": source, "methods": [part[2] for part in parts], "window": window, "order": order}
+    how |= {"state": entries and dataclasses.asdict(entries), "frames": view and dataclasses.asdict(view)}
     how |= quality | {"differences": {q: d.tolist() for q, d in differences.items()}}
     write_columns(root, output, info, table, new, names, {META: meta, DERIVED: how})
     return {"differences": differences, "quality": quality, "view": view}

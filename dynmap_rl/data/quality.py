@@ -40,7 +40,8 @@ LIMITS = {
     ),
     "jumps": (
         0.005, True, "share of the steps in which a position jumps by more than a quarter of its extent",
-        "look at the frames there: the track has gone to another object, or the sensor failed",
+        "look at the frames there: the track has gone to another object, or the sensor failed; name an angle of a state that "
+        "jumps by its period in --angles",
     ),
     "residual": (
         0.02, True, "distance from a smooth trajectory, root mean square, as a share of the extent of the motion",
@@ -88,9 +89,17 @@ def judge_quality(derived: Sequence[Derived]) -> dict:
         ``good``, ``where`` (that object or entry), ``episode`` (the worst one), ``what`` and ``advice``.
     """
     rows: dict[int, dict] = {}  # values by check and place, by episode
+    extents: dict[
+        str, list[float]
+    ] = {}  # of each entry of a state, by episode: entries may have different units
+    for part in derived:
+        if part.motion.found is None:
+            for name, extent in zip(part.names, _extent(part.position), strict=True):
+                extents.setdefault(name, []).append(extent)
+    means = {name: float(np.mean(values)) for name, values in extents.items()}
     for part in derived:
         row = rows.setdefault(part.episode, {})
-        for name, values in _measure(part).items():
+        for name, values in _measure(part, means).items():
             row.setdefault(name, {}).update(values)
     checks = {}
     for name, (limit, more, what, advice) in LIMITS.items():
@@ -134,18 +143,18 @@ def quality_text(quality: dict) -> str:
     return "\n".join(lines)
 
 
-def _measure(episode: Derived) -> dict[str, dict[str, float]]:
-    """Return every measure of an episode by object or entry."""
+def _measure(episode: Derived, extents: dict[str, float]) -> dict[str, dict[str, float]]:
+    """Return every measure of an episode by object or entry, given the mean extents of a state's entries."""
     names, position, motion = episode.names, episode.position, episode.motion
     lines = [i for i in range(position.shape[1]) if i not in motion.angles]
-    extent = np.quantile(position, 0.95, 0) - np.quantile(position, 0.05, 0)
-    extent = max(extent[lines].max(initial=0.0), 1e-9)
+    shared = _extent(position)[lines].max(initial=0.0)  # of entries that are found in the frames
+    extent = np.maximum([extents.get(name, shared) for name in names], 1e-9)
     rest = position - _smooth(position)
     rms = np.sqrt(np.square(rest).mean(0))
     result = {
-        "residual": {names[i]: rms[i] / extent for i in lines},
+        "residual": {names[i]: rms[i] / extent[i] for i in lines},
         "residual_angle": {names[i]: rms[i] * 2 * np.pi / motion.period for i in motion.angles},
-        "jumps": {names[i]: _jumps(position[:, i], extent) for i in lines},
+        "jumps": {names[i]: _jumps(position[:, i], extent[i]) for i in lines},
     }
     if motion.found is not None:
         bodies = _bodies(names, motion.found.shape[1])
@@ -174,6 +183,11 @@ def _bodies(names: Sequence[str], count: int) -> list[str]:
     if count == 1:
         return [names[0].rpartition("_")[0] or "all that moves"]
     return [name.rpartition("_")[0] for name in names[:: len(names) // count]]
+
+
+def _extent(position: np.ndarray) -> np.ndarray:
+    """Return the range of each entry ``[T, D]`` without its outermost tenth, ``[D]``."""
+    return np.quantile(position, 0.95, 0) - np.quantile(position, 0.05, 0)
 
 
 def _smooth(position: np.ndarray) -> np.ndarray:

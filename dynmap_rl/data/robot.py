@@ -51,11 +51,12 @@ def describe_robot_dataset(
             f"{root} must have the columns {', '.join(missing)}; add dynamics with recipes/add_dynamics.py, or train "
             "with --world_model.supervision none"
         )
+    views = [name.strip() for name in camera.split(",")] if camera else [None]
     columns = {"action": "action"} | {q: f"dynamics.{q}" for q in DYNAMICS if f"dynamics.{q}" in features}
     return {
         "root": root,
         "info": info,
-        "cameras": [choose_camera(root, info, name) for name in (camera.split(",") if camera else [None])],
+        "cameras": [choose_camera(root, info, name) for name in views],
         "goal": _check_goal(root, info, goal),
         "names": {key: entry_names(info, column) for key, column in columns.items()},
     }

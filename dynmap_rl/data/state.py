@@ -63,8 +63,10 @@ def choose_state(
     Raises:
         ValueError: an argument is wrong.
     """
-    if noise < 0 or angle_noise < 0:
+    if not (0 <= noise < math.inf and 0 <= angle_noise < math.inf):
         raise ValueError(f"--noise and --angle_noise must be at least 0, got {noise} and {angle_noise}")
+    if not 0 < period < math.inf:
+        raise ValueError(f"--period must be above 0, got {period}")
     numbers = ("float32", "float64")
     vectors = [n for n, f in info["features"].items() if f["dtype"] in numbers and len(f["shape"]) == 1]
     if column not in vectors:

@@ -57,7 +57,7 @@ def _write_page(folder: Path, root: Path, settings: dict, command: str, said: st
     lines += [*said.splitlines(), "", *_ranges(root, info, quantities)]
     _plot_dynamics(root, info, quantities, folder / "dynamics.png")
     if any(feature["dtype"] in ("image", "video") for feature in info["features"].values()):
-        _film(root, info, folder / "episodes.gif")
+        _film(root, info, choose_camera(root, info, settings.get("camera")), folder / "episodes.gif")
     return write_html(folder, f"Dataset {root.name}", "\n".join(lines), command, settings)
 
 
@@ -93,12 +93,12 @@ def _plot_dynamics(root: Path, info: dict, quantities: list[str], path: Path) ->
     save_figure(figure, path)
 
 
-def _film(root: Path, info: dict, path: Path) -> None:
+def _film(root: Path, info: dict, camera: str, path: Path) -> None:
     """Write the first episodes; long ones are thinned out, and short ones stand still at their end."""
     from .media import save_gif
 
     episodes = []
-    for _, frames, _ in iterate_frames(root, info, choose_camera(root, info), widest=WIDEST):
+    for _, frames, _ in iterate_frames(root, info, camera, widest=WIDEST):
         episodes.append(frames)
         if len(episodes) == EPISODES:
             break

@@ -31,7 +31,8 @@ UNITS = {
 @torch.no_grad()
 def predict(world_model: WorldModel, episodes: TensorDictBase) -> TensorDictBase:
     """Return the episodes ``[E, T]`` with the world model's one-step predictions."""
-    return make_world_model_module(world_model)(episodes.select("pixels", "action", "dynamics").clone(False))
+    episodes = episodes.select("pixels", "action", "dynamics", strict=False)
+    return make_world_model_module(world_model)(episodes.clone(False))
 
 
 def plot_reconstruction(

@@ -7,8 +7,9 @@ import html
 import io
 from pathlib import Path
 
-from dynmap_rl.runs.folder import flatten, read_metrics
+from dynmap_rl.runs.folder import read_metrics
 from dynmap_rl.utils.files import read_json, write_bytes
+from dynmap_rl.utils.settings import flatten
 
 STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 60em; margin: 2em auto; padding: 0 1em; color: #222 }

@@ -61,7 +61,8 @@ def write_robot_report(
 
     results = read_results(folder, seeds, frozen)
     errors = {k: float(np.mean([r["held_out"][k] for r in results])) for k in results[0]["held_out"]}
-    names = describe_robot_dataset(dataset, camera, goal)["names"]
+    described = describe_robot_dataset(dataset, camera, goal)
+    names, dt = described["names"], 1 / (described["info"].get("fps") or 1)
     names = {key: names[key] for key in (*world_model.supervision, "action")}
     result = {
         "row": row_name(world_model.supervision, source["training"]),
@@ -82,7 +83,7 @@ def write_robot_report(
         "commit": find_commit(),
         "results": results,
     }
-    plot_reconstruction(world_model.cpu(), episodes[:3], folder / "figures" / "reconstruction.png")
+    plot_reconstruction(world_model.cpu(), episodes[:3], folder / "figures" / "reconstruction.png", dt=dt)
     title = f"{result['row']}, {policy} policy, {dataset}"
     write_html(folder, title, robot_row_text(result), command, settings)
     write_json(folder / "eval.json", result)  # last: it marks the run as complete

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from dynmap_rl.utils.files import lock_folder, read_json, write_bytes, write_json
 from dynmap_rl.utils.ranks import first_rank_first, rank
+from dynmap_rl.utils.settings import flatten
 
 FORMAT = 2  # of config.json; the first release had flat settings
 
@@ -64,14 +65,6 @@ def _open(folder: Path, config, ignore: tuple[str, ...]) -> Path:
 def plain_settings(config) -> dict:
     """Return a dataclass of settings as a nested dict of JSON values."""
     return json.loads(json.dumps(dataclasses.asdict(config), default=str))
-
-
-def flatten(settings: dict, prefix: str = "") -> dict:
-    """Return nested settings with dotted names, such as ``world_model.updates``."""
-    flat = {}
-    for name, value in settings.items():
-        flat |= flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
-    return flat
 
 
 def append_metrics(folder: Path, step: int, **metrics: float) -> None:

@@ -19,6 +19,8 @@ import typing
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from .settings import flatten
+
 HINTS = {
     **dict.fromkeys(
         (errno.ENOSPC, errno.EDQUOT, errno.EFBIG), "free some space and repeat the command, which resumes"
@@ -65,7 +67,7 @@ def parse_settings(config_class: type, arguments: Sequence[str]):
     """Return the dataclass of settings that options, then a file given by ``--config_path``, then defaults set.
 
     Draccus alone would replace a nested default such as ``PPOTraining(iterations=90)`` by ``PPOTraining()`` as soon as
-    another option of the group is given.
+    another option of the group is given, and in its help.
 
     Raises:
         ValueError: the file is not a YAML file of settings.
@@ -83,7 +85,10 @@ def parse_settings(config_class: type, arguments: Sequence[str]):
     with tempfile.NamedTemporaryFile("w", suffix=".yaml") as merged:
         yaml.safe_dump(settings, merged)
         merged.flush()
-        return draccus.parse(config_class, merged.name, arguments, exit_on_error=False)
+        options = draccus.argparsing.ArgumentParser(config_class, merged.name, exit_on_error=False)
+        if "--help" in arguments:  # draccus would show the defaults of the nested classes
+            options.parser.set_defaults(**flatten(settings))
+        return options.parse_args(arguments)
 
 
 def read_settings(path: Path) -> dict:

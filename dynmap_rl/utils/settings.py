@@ -1,4 +1,4 @@
-"""Checks that dataclasses of settings share."""
+"""Checks that dataclasses of settings share, and settings as one flat dict."""
 
 from __future__ import annotations
 
@@ -25,3 +25,11 @@ def check_choice(settings, name: str, choices: Sequence[str]) -> None:
         raise ValueError(
             f"{type(settings).__name__}.{name} must be one of {', '.join(choices)}, got {value!r}"
         )
+
+
+def flatten(settings: dict, prefix: str = "") -> dict:
+    """Return nested settings with dotted names, such as ``world_model.updates``."""
+    flat = {}
+    for name, value in settings.items():
+        flat |= flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return flat

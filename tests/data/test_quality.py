@@ -1,5 +1,7 @@
 """Quality of derived columns: films and positions that are good, and bad in one known way."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from films import film, make_poses
@@ -89,6 +91,44 @@ def test_a_fault_of_positions_is_found(name, change):
     assert all(check["good"] for check in good.values()) and not bad[name]["good"]
 
 
+def test_entries_of_a_state_have_units_of_their_own():
+    noise = 0.02 * np.random.default_rng(0).standard_normal(120)
+    position = np.stack([POSES[:, 0, 0] + noise, np.linspace(0, 100, 120)], 1)  # m, and a gripper in %
+    found = judge_quality([Derived(0, ["x", "grip"], position, position, Motion(position, []))])
+    assert found["checks"]["residual"]["where"] == "x" and found["verdict"] == "doubtful"
+
+
+def test_a_joint_that_rests_in_one_episode_is_no_fault():
+    noise = 1e-4 * np.random.default_rng(0).standard_normal((120, 1))
+    moves, rests = POSES[:, 0, :1], POSES[:1, 0, :1] + noise
+    episodes = [Derived(i, ["x"], p, p, Motion(p, [])) for i, p in enumerate((moves, rests))]
+    assert judge_quality(episodes)["verdict"] == "good"
+
+
+def test_a_position_that_moves_far_in_every_step_does_not_jump():
+    position = POSES.reshape(120, 6) + np.arange(120)[:, None] % 2 * [0, 3, 0, 0, 0, 0]
+    assert judge_state(position)["jumps"]["value"] == 0
+
+
+def test_the_flow_of_every_object_is_compared_with_its_own_velocity():
+    velocity = np.gradient(POSES.reshape(120, 6), axis=0)
+    motion = measure(film(POSES), 1.0, Camera("tracks", "front", 2), 20)
+    motion = replace(motion, other=velocity * [1, 1, 1, -1, -1, 1])
+    quality = judge_quality([Derived(7, NAMES, motion.position, velocity, motion)])
+    check = quality["checks"]["agreement"]
+    assert check["where"] == "high" and check["value"] == pytest.approx(-1)
+
+
+def test_the_worst_episode_is_that_of_the_check_farthest_beyond_its_limit():
+    """Of some checks the value must be at least the limit."""
+    checks = {"lost": {"value": 0.055, "episode": 1}, "size": {"value": 40.0, "episode": 2}}
+    for name, check in checks.items():
+        check["limit"] = LIMITS[name][0]
+    assert worst_episode({"checks": checks}) == 1
+    checks["size"]["value"] = 1.0
+    assert worst_episode({"checks": checks}) == 2
+
+
 def test_angles_in_degrees_are_judged_like_those_in_radians():
     noisy = POSES.reshape(120, 6) + 0.2 * np.random.default_rng(0).standard_normal((120, 6)) * [
         0,
@@ -106,7 +146,8 @@ def test_angles_in_degrees_are_judged_like_those_in_radians():
 
 def test_noise_of_positions_is_measured():
     """The smooth trajectory follows a part of the noise: three of the seven steps of its window are free."""
-    position, extent = POSES.reshape(120, 6), np.ptp(np.quantile(POSES[:, 0, 0], [0.05, 0.95]))
+    position = POSES.reshape(120, 6)
+    extent = np.ptp(np.quantile(position, [0.05, 0.95], axis=0)[:, [0, 1, 3, 4]], axis=0).min()
     noisy = position + 0.005 * np.random.default_rng(1).standard_normal(position.shape)
     assert judge_state(noisy)["residual"]["value"] * extent == pytest.approx(0.005 * (4 / 7) ** 0.5, rel=0.25)
 

@@ -81,6 +81,14 @@ def test_splits_that_the_dataset_names_are_kept(folders, tmp_path):
     assert splits["train"]["episode"].unique().tolist() == [1, 2]
 
 
+def test_splits_that_share_episodes_are_refused(tmp_path):
+    root = make_robot_dataset(tmp_path / "named", (12, 12, 12))
+    path = root / "meta/info.json"  # LeRobot writes the split train of all episodes
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"splits": {"train": "0:3", "eval": "2:3"}}))
+    with pytest.raises(ValueError, match="must not share episodes, got 2 to 2"):
+        load_robot_dataset(root, 5)
+
+
 def test_episodes_that_are_too_short_are_left_out_and_long_ones_cut(tmp_path):
     root = make_robot_dataset(tmp_path / "lengths", (130, 8, 125))
     splits, _ = load_robot_dataset(root, 20)

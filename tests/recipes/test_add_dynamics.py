@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 from itertools import pairwise
@@ -242,9 +243,7 @@ def test_one_entry_is_a_column_of_numbers(images, tmp_path):
 def test_a_killed_run_leaves_nothing_that_looks_done(images, tmp_path):
     output = tmp_path / "output"
     arguments = "--dataset", str(images[0]), "--output", str(output)
-    kill = (
-        "import os; from dynmap_rl.data.format import columns; columns._write_stats = lambda *a: os._exit(9);"
-    )
+    kill = "import os; from dynmap_rl.data.format import columns; columns.compute_stats = lambda *a: os._exit(9);"
     code = f"{kill} import runpy, sys; sys.argv[1:] = {list(arguments)}; runpy.run_path({str(RECIPE)!r}, run_name='__main__')"
     killed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=os.environ)
     assert killed.returncode == 9, killed.stderr
@@ -264,6 +263,9 @@ def test_state_and_tracks_stand_side_by_side_and_are_judged_together(videos, tmp
     pixels = np.array([128, 96])
     assert np.abs(position[:, 2:] - pixels * position[:, :2]).max() < 2
     assert np.corrcoef(velocity[:, 2], velocity[:, 0])[0, 1] > 0.95  # squares are drawn at whole pixels
+    how = json.loads((output / "meta/dynamics.json").read_text())
+    assert how["methods"] == ["central", "savgol"] and how["state"]["columns"] == [0, 1]
+    assert how["frames"]["point"] and how["frames"]["colors"] == [[200, 30, 30]]
     checks = json.loads((tmp_path / "runs/add_dynamics/both/quality.json").read_text())["checks"]
     assert {"lost", "residual", "agreement"} < set(checks) and "residual_angle" not in checks
     assert (tmp_path / "runs/add_dynamics/both/tracks.png").exists()
@@ -301,7 +303,11 @@ def test_state_and_tracks_stand_side_by_side_and_are_judged_together(videos, tmp
         ({"source": "tracks", "sort": "oldest"}, "--sort .*'oldest'"),
         ({"source": "tracks", "noise": 0.1}, "--noise has no effect"),
         ({"source": "tracks", "width": -1.0}, "--width"),
+        ({"source": "tracks", "width": float("inf")}, "--width"),
+        ({"source": "tracks", "objects": 300}, "--objects"),
         ({"noise": -1.0}, "--noise"),
+        ({"noise": float("nan")}, "--noise"),
+        ({"angles": "2", "period": 0.0}, "--period must be above 0"),
         ({"window": 21}, "--window has no effect with --method central"),
         (
             {"source": "tracks", "method": "central", "order": 4},
@@ -314,6 +320,23 @@ def test_bad_input_is_refused_before_anything_is_written(images, tmp_path, setti
     with pytest.raises(ValueError, match=message):
         main(Config(**({"dataset": str(images[0]), "output": tmp_path / "bad"} | settings)))
     assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["stats.json", "episodes/chunk-000/file-000.parquet"])
+def test_a_damaged_file_is_named_and_nothing_is_left(images, tmp_path, name):
+    shutil.copytree(images[0], tmp_path / "damaged")
+    path = tmp_path / "damaged/meta" / name
+    path.write_bytes(path.read_bytes()[:50])
+    with pytest.raises(ValueError, match=name):
+        main(Config(dataset=str(tmp_path / "damaged"), output=tmp_path / "new"))
+    assert [path.name for path in tmp_path.iterdir()] == ["damaged"]
+
+
+def test_a_dataset_is_complete_without_its_page(images, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs").touch()
+    main(Config(dataset=str(images[0]), output=tmp_path / "new"))
+    assert "no page in runs" in capsys.readouterr().out and (tmp_path / "new/meta/dynamics.json").exists()
 
 
 def test_a_folder_and_columns_that_exist_are_refused(images, tmp_path):

@@ -5,9 +5,11 @@ import shutil
 import pytest
 from commands import PRESETS, place_recordings, run, run_small
 from safetensors.torch import load_file, save_file
+from small import CONSTANTS
 
+from dynmap_rl.modules.checkpoints import make_world_model, save_world_model
 from dynmap_rl.runs.lookup import SHIPPED
-from dynmap_rl.utils.files import read_json
+from dynmap_rl.utils.files import read_json, write_json
 
 WEIGHTS = "world_model/weights.safetensors"
 TASK = "bin_dropping"
@@ -19,6 +21,10 @@ def small(tmp_path_factory, recordings):
     folder = tmp_path_factory.mktemp("generalize")
     place_recordings(folder, recordings, "balance_reaching", TASK)
     shutil.copytree(SHIPPED / "balance_reaching", folder / "runs/source")
+    six = {"low": [-1.0] * 6, "high": [1.0] * 6}
+    save_world_model(folder / "runs/robot/world_model", make_world_model(CONSTANTS | {"action": six}, ()))
+    source = {"training": "decoupled", "dataset": "robot"}
+    write_json(folder / "runs/robot/eval.json", {"world_model": source})
     return folder, run_small(folder, "generalize", "--task", TASK, "--pretrained", "runs/source")
 
 
@@ -58,6 +64,7 @@ def test_another_world_model_in_its_place_is_refused(small, tmp_path):
     [
         (["--task", "balance_reaching"], "balance_reaching for both"),
         (["--task", "juggling"], "juggling"),
+        (["--task", TASK, "--pretrained", "runs/robot"], "with the actions of bin_dropping, got runs/robot"),
         (["--task", TASK, "--pretrained", "nowhere"], "nowhere holds no finished run"),
         (["--task", TASK, "--dataset", "datasets/balance_reaching"], "must be a dataset of bin_dropping"),
     ],

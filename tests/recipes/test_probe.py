@@ -20,6 +20,9 @@ def trained(recording, tmp_path_factory):
         save_world_model(folder / name / "world_model", make_world_model(ranges, supervision))
         source = {"task": "balance_reaching", "training": "decoupled"}
         write_json(folder / name / "eval.json", {"world_model": source})
+    six = {"low": [-1.0] * 6, "high": [1.0] * 6}
+    save_world_model(folder / "robot" / "world_model", make_world_model(constants | {"action": six}, ()))
+    write_json(folder / "robot" / "eval.json", {"world_model": {"training": "decoupled", "dataset": "robot"}})
     return folder
 
 
@@ -53,6 +56,7 @@ def test_writes_errors_and_probes_of_every_world_model(trained, recording, tmp_p
     ("arguments", "message"),
     [
         (["--runs", "nothing"], "nothing"),
+        (["--runs", "robot"], "must be of tasks 1 to 3, got robot"),
         (["--runs", "none,none"], "Only-RGB, decoupled twice"),
         (["--runs", "none", "--test_episodes", "0"], "test_episodes"),
         (["--runs", "position", "--horizon", "200"], "120, got 20 + 200"),

@@ -65,10 +65,20 @@ def test_a_run_measures_held_out_errors(datasets, tmp_path, method, arguments, g
     assert closed_loop.returncode == 2 and "gliding" in closed_loop.stderr, "there is no simulator"
 
 
+@pytest.mark.slow
+def test_a_dataset_without_dynamics_trains_on_its_frames_in_permuted_colours(datasets, tmp_path):
+    options = "--world_model.supervision", "none", "--world_model.augmentation.recolor", "true"
+    run_small(tmp_path, "robot", "--dataset", datasets / "plain", *options)
+    [folder] = (tmp_path / "runs/robot/plain").iterdir()
+    assert read_json(folder / "eval.json")["held_out"].keys() == {"rgb", "imitation_l1", "action"}
+    assert (folder / "figures/reconstruction.png").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ([], "--dataset must"),
+        (["--dataset", "gliding", "--world_model.augmentation.mirror", "true"], "no known mirror image"),
         (["--dataset", "plain"], "dynamics.position"),
         (["--dataset", "gliding", "--camera", "front"], "observation.images.top"),
         (["--dataset", "gliding", "--goal", "observation.state:9"], "observation.state"),

@@ -17,6 +17,7 @@ PACKAGE = Path(__file__).parents[2] / "dynmap_rl"
 @dataclass(frozen=True)
 class Group:
     updates: int = 5
+    # Some rate.
     rate: float = 0.1
 
     def __post_init__(self):
@@ -66,6 +67,14 @@ def test_null_clears_an_option(run, tmp_path):
 
 def test_a_nested_option_leaves_the_other_defaults_of_its_group(run):
     assert run("--second.updates", "7") == Settings(second=Group(7, 0.5))
+
+
+def test_the_help_shows_the_defaults_that_apply(run, capsys):
+    with pytest.raises(SystemExit):
+        run("--help")
+    lines = " ".join(capsys.readouterr().out.split())
+    assert "--first.rate float Some rate. (default: 0.1)" in lines
+    assert "--second.rate float Some rate. (default: 0.5)" in lines
 
 
 def test_a_file_of_settings_and_options_that_override_it(run, tmp_path):

@@ -6,7 +6,6 @@ leaves an incomplete folder behind when it is stopped.
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from pathlib import Path
@@ -43,9 +42,11 @@ def write_columns(
             leaves a file out.
 
     Raises:
+        ValueError: a file of the dataset is damaged.
         OSError: the folder cannot be written.
     """
     temporary, replaced = output.with_name(f"{output.name}.tmp"), replaced or {}
+    stats = read_json(path) if (path := root / "meta" / "stats.json").exists() else {}
     try:
         shutil.rmtree(temporary, ignore_errors=True)
         for file in sorted(path for path in root.rglob("*") if path.is_file()):
@@ -65,7 +66,9 @@ def write_columns(
         shape = [len(names)]
         features = {name: {"dtype": "float32", "shape": shape, "names": names} for name in values}
         write_json(temporary / "meta" / "info.json", info | {"features": info["features"] | features})
-        _write_stats(temporary / "meta" / "stats.json", values)
+        for name, numbers in values.items():
+            stats[name] = {key: value.tolist() for key, value in compute_stats(numbers).items()}
+        write_json(temporary / "meta" / "stats.json", stats)
         for name, content in replaced.items():
             if content is not None:
                 write_json(temporary / name, content)
@@ -106,7 +109,10 @@ def _write_episodes(
     file: Path, target: Path, rows_of: dict[int, slice], values: dict[str, np.ndarray]
 ) -> None:
     """Write the episodes' metadata with statistics of the new columns."""
-    rows = pq.ParquetFile(file).read()
+    try:
+        rows = pq.ParquetFile(file).read()
+    except (OSError, pa.ArrowException) as error:
+        raise ValueError(f"{file} is damaged ({error}); restore it or download the dataset again") from error
     old = tuple(f"stats/{name}/" for name in values)
     rows = rows.drop_columns([name for name in rows.column_names if name.startswith(old)])
     for name, numbers in values.items():
@@ -114,13 +120,6 @@ def _write_episodes(
         for key in stats[0]:
             rows = rows.append_column(f"stats/{name}/{key}", pa.array([s[key].tolist() for s in stats]))
     pq.write_table(rows, target)
-
-
-def _write_stats(path: Path, values: dict[str, np.ndarray]) -> None:
-    stats = read_json(path) if path.exists() else {}
-    for name, numbers in values.items():
-        stats[name] = {key: value.tolist() for key, value in compute_stats(numbers).items()}
-    path.write_text(json.dumps(stats, indent=4))
 
 
 def compute_stats(numbers: np.ndarray) -> dict[str, np.ndarray]:

@@ -55,8 +55,8 @@ SIMULATED = f"""\
 The dynamics are the simulator's. The acceleration is the change of the velocity since the last step over {CONTROL_DT} s, and
 0 at the start."""
 DERIVATION = """\
-The dynamics were derived with `python recipes/add_dynamics.py --source {source} --method {method}`, and are {verdict} by the
-checks in `meta/dynamics.json`."""
+The dynamics were derived with `python recipes/add_dynamics.py --source {source}`, and are judged {verdict}. All options and
+checks are in `meta/dynamics.json`."""
 
 
 def push_dataset(root: str | Path, repo_id: str) -> None:

@@ -128,10 +128,15 @@ def choose_splits(root: Path, info: dict, episodes: list[int]) -> dict[str, list
         episodes: indices to choose from.
 
     Raises:
-        ValueError: there are fewer than two episodes, or a named split is empty.
+        ValueError: there are fewer than two episodes, or named splits are empty or share episodes.
     """
     if {"train", "eval"} <= (info.get("splits") or {}).keys():
         members = {name: read_split(root, info, name) for name in ("train", "eval")}
+        if shared := sorted(set(members["train"]) & set(members["eval"])):
+            raise ValueError(
+                f"the splits train and eval of {root} must not share episodes, got {shared[0]} to {shared[-1]} in both; "
+                "correct meta/info.json"
+            )
         splits = {name: [e for e in episodes if e in members[name]] for name in members}
     else:
         held_out = episodes[9::10] or episodes[-1:]

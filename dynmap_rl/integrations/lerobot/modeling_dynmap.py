@@ -13,6 +13,7 @@ from tensordict import TensorDict
 from dynmap_rl.data.augmentation import augment
 from dynmap_rl.data.demonstrations import find_meta
 from dynmap_rl.data.normalization import normalization_constants
+from dynmap_rl.envs.world import ACTION_LIMIT
 from dynmap_rl.keys import DYNAMICS
 from dynmap_rl.modules.actor import Actor
 from dynmap_rl.modules.checkpoints import make_policy, make_world_model
@@ -52,7 +53,12 @@ class DynmapPolicy(PreTrainedPolicy):
         self.trainable, self.symmetric = dataset_meta is not None, bool(config.symmetric)
         if dataset_meta is not None:
             columns, meta = read_columns(dataset_meta.root), find_meta(Path(dataset_meta.root))
-            # A dataset that LeRobot's tools have edited has no metadata.
+            if meta is None and columns["action"].shape[-1] != len(ACTION_LIMIT):
+                raise ValueError(
+                    f"{dataset_meta.root} must be a recording, with an action of {len(ACTION_LIMIT)} entries, got "
+                    f"{columns['action'].shape[-1]}; train on robot datasets with recipes/robot.py"
+                )
+            # A recording that LeRobot's tools have edited has no metadata.
             constants = meta["normalization"] if meta else normalization_constants(columns[None])
             config.sizes = {name: len(constants[name]["low"]) for name in config.sizes}
             if config.sizes["goal"] != GOAL:
