@@ -54,14 +54,33 @@ def test_goal_moves_with_the_cart():
     torch.testing.assert_close(out["apart"].abs(), episodes["apart"].abs(), atol=1e-6, rtol=0)
 
 
+def test_a_mirrored_window_is_mirrored_in_all_its_entries():
+    episodes = make_episodes()
+    episodes["expert_action"] = 2 * episodes["action"]
+    out = augment(episodes, torch.Generator().manual_seed(0), max_shift=0, recolor=False)
+    mirrored = (out["goal"] != episodes["goal"]).any(-1)[:, 0]
+    assert 0 < mirrored.sum() < 8
+    for a, b, flip in zip(out, episodes, mirrored, strict=True):
+        sign = torch.tensor([-1.0, 1.0, -1.0]) if flip else torch.ones(3)
+        assert torch.equal(a["pixels"], b["pixels"].flip(-1) if flip else b["pixels"])
+        for key in ("action", "expert_action"):
+            assert torch.equal(a[key], b[key] * sign)
+        for quantity in ("velocity", "acceleration"):
+            assert torch.equal(a["dynamics", quantity], b["dynamics", quantity] * sign.repeat(2))
+        angles = [td["dynamics", "position"][:, [2, 5]] for td in (a, b)]
+        assert torch.equal(angles[0], angles[1] * sign[2])
+
+
 def test_options_leave_the_other_changes_as_they_are():
-    episodes = make_episodes(4)
+    episodes = make_episodes()
     every, same_colors = (
         augment(episodes, torch.Generator().manual_seed(3), recolor=r) for r in (True, False)
     )
     assert (every.exclude("pixels") == same_colors.exclude("pixels")).all()
     assert not torch.equal(every["pixels"], same_colors["pixels"])
     assert torch.equal(every["pixels"].sum(2), same_colors["pixels"].sum(2)), "channels are permuted"
+    plain = augment(episodes, torch.Generator().manual_seed(3), mirror=False)["goal"]
+    assert torch.equal(plain[..., 1], every["goal"][..., 1]) and not torch.equal(plain, every["goal"])
     off = augment(episodes, torch.Generator(), max_shift=0, mirror=False, recolor=False)
     assert (off == episodes.select(*off.keys())).all()
 

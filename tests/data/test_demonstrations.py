@@ -278,6 +278,18 @@ def test_demonstrations_are_both_splits_and_the_constants(recording, copy):
     assert constants == normalization_constants(parts["train"])
 
 
+def test_the_split_for_training_may_come_last(recording, copy):
+    whole, path = load_dataset(recording), copy / "meta" / "dynmap.json"
+    change_info(copy, lambda info: info.update(splits={"eval": "0:2", "train": "2:6"}))
+    meta = json.loads(path.read_text())
+    meta["normalization"]["goal"]["high"] = [7.0, 7.0]
+    path.write_text(json.dumps(meta))
+    parts, constants = load_demonstrations(copy)
+    assert constants["goal"]["high"] == [7.0, 7.0], "those of the recording"
+    assert (parts["train"] == whole[2:]).all() and (parts["eval"] == whole[:2]).all()
+    assert (load_dataset(copy) == whole).all()
+
+
 def test_a_recording_of_the_first_release_is_refused_with_what_to_do(copy):
     path = copy / "meta" / "dynmap.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"format": 2}))

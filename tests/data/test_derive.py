@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from dynmap_rl.data.derive import differentiate
+from dynmap_rl.data.camera import Motion
+from dynmap_rl.data.derive import _derive, differentiate
 
 EVEN = np.arange(20) / 25
 UNEVEN = np.cumsum(np.random.default_rng(0).uniform(0.02, 0.08, 20))
@@ -19,6 +20,24 @@ def test_central_differences_of_a_parabola_are_exact(time):
     v, a = differentiate(position, time)
     assert np.abs(v - velocity).max() < 1e-10
     assert np.abs(a - acceleration).max() < 1e-8
+
+
+def test_differences_at_the_ends_are_of_second_order_too():
+    acceleration = differentiate((EVEN**3)[:, None], EVEN)[1][:, 0]
+    assert np.abs(acceleration - 6 * EVEN).max() < 0.2  # 0.24 with differences of first order at the ends
+
+
+def test_an_angle_in_degrees_jumps_by_360():
+    angle = (400 * EVEN[:, None] + 180) % 360 - 180  # 16 in a step, which is not a jump
+    found, _ = _derive(Motion(angle, [0], 360), EVEN, "central", 11, 3)
+    np.testing.assert_allclose(found["velocity"], 400)
+
+
+def test_the_acceleration_of_a_measured_velocity_is_its_derivative():
+    position, velocity, acceleration = parabola(EVEN)
+    found, motion = _derive(Motion(0 * position, [], velocity=velocity), EVEN, "central", 11, 3)
+    np.testing.assert_allclose(found["acceleration"], np.broadcast_to(acceleration, (20, 2)))
+    assert found["velocity"] is velocity and not motion.other.any()
 
 
 def test_savgol_is_exact_up_to_its_order():

@@ -1,16 +1,17 @@
 """Rollouts are recorded as they happened, row by row, in every task."""
 
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
 from dynmap_rl.data.demonstrations import load_dataset, load_meta
-from dynmap_rl.data.recording.plans import Plan, mark_pushes, plan_demonstrations, roll_out
+from dynmap_rl.data.recording.plans import Plan, mark_pushes, plan_demonstrations, push, roll_out
 from dynmap_rl.data.recording.record import record_dataset
 from dynmap_rl.envs.tasks import TASKS, get_task
-from dynmap_rl.envs.world import CONTROL_DT
+from dynmap_rl.envs.world import CONTROL_DT, LARGEST_CHANGE
 from dynmap_rl.experts.network import find_expert, list_checkpoints
 from dynmap_rl.keys import DYNAMICS
 
@@ -72,6 +73,22 @@ def test_a_row_is_what_was_seen_before_its_action(dataset):
     torch.testing.assert_close(moved, mean, atol=2e-6, rtol=0)
     off_by_one = (episodes["action"][:, 1:] + episodes["action"][:, :-1]) / 2
     assert (moved - off_by_one).abs().max() > 1e-4
+
+
+def test_the_expert_s_actions_could_be_executed(dataset):
+    episodes = load_dataset(dataset).double()
+    change = episodes["expert_action"][:, 1:] - episodes["action"][:, :-1]
+    assert (change.abs() <= torch.from_numpy(LARGEST_CHANGE) + 1e-7).all()
+
+
+def test_every_push_is_another_and_constant():
+    world, plan = SimpleNamespace(action=np.zeros(3)), Plan(3, "any", pushes=((0, 3), (5, 8)))
+    actions = np.full((9, 1, 3), 9.0)
+    for t, action in enumerate(actions):
+        push(t, action, [plan], [world])
+    assert (actions[[3, 4, 8]] == 9).all()
+    assert (actions[:3] == actions[0]).all() and (actions[5:8] == actions[5]).all()
+    assert (actions[0] != actions[5]).all()
 
 
 def test_next_columns_come_after_the_action(dataset):

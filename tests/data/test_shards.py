@@ -8,11 +8,12 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from dynmap_rl.data.demonstrations import FORMAT, load_dataset, load_meta
+from dynmap_rl.data.demonstrations import FORMAT, META, load_dataset, load_meta
 from dynmap_rl.data.recording import shards as module
 from dynmap_rl.data.recording.record import _plan_shards
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.experts.network import list_checkpoints
+from dynmap_rl.utils.files import read_json
 
 
 @pytest.mark.parametrize("name", ["balance_reaching", "bin_dropping"])
@@ -70,6 +71,17 @@ def test_failures_are_replaced_by_the_next_candidates(tmp_path, monkeypatch):
         )
         with pytest.raises(ValueError, match=advice):
             module._roll_out_shard(shard)
+
+
+def test_constants_are_those_of_the_training_episodes(tmp_path, monkeypatch):
+    names = {"task": "balance_reaching", "expert": "balance_reaching", "kind": "exploration"}
+    shards = [module.Shard(tmp_path, **names, split=s, number=0, count=2) for s in ("train", "eval")]
+    episodes = TensorDict({"number": torch.arange(4)[:, None].expand(4, 120)}, [4, 120])
+    monkeypatch.setattr(module, "read_json", lambda *_: [{}, {}])
+    monkeypatch.setattr(module, "merge_datasets", lambda *_: episodes)
+    monkeypatch.setattr(module, "normalization_constants", lambda part: part["number"][:, 0].tolist())
+    module.merge_shards(shards, tmp_path, names | {"episodes": 2})
+    assert read_json(tmp_path / META)["normalization"] == [0, 1]
 
 
 def test_shards_never_share_a_scene(tmp_path):

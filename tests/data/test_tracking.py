@@ -24,6 +24,24 @@ def test_a_square_is_found_to_half_a_pixel_though_it_rests_for_most_of_the_time(
     assert np.median(error) < 1.5
 
 
+def test_specks_are_left_out_of_a_centroid():
+    positions = np.stack([np.linspace(0.2, 0.8, 40), np.full(40, 0.5)], 1)
+    frames = np.stack([draw(p) for p in positions])
+    specked = frames.copy()
+    rng = np.random.default_rng(0)
+    for frame in specked:  # in the upper rows, which the square does not reach
+        frame[rng.integers(0, 20, 30), rng.integers(0, 128, 30)] = 0
+    np.testing.assert_allclose(track_centroid(specked)[0], track_centroid(frames)[0], atol=0.1)
+
+
+def test_pixels_of_a_centroid_weigh_by_their_difference():
+    frames = np.full((41, 32, 96, 3), 200, np.uint8)
+    for t, frame in enumerate(frames):  # a dark square and, right of it, its light shadow
+        frame[12:20, 2 * t : 2 * t + 4], frame[12:20, 2 * t + 4 : 2 * t + 8] = 50, 150
+    centroid, _ = track_centroid(frames)
+    np.testing.assert_allclose(centroid[10:30, 0], 2 * np.arange(10, 30) + 1.5 + 4 / 4, atol=0.01)
+
+
 @pytest.mark.parametrize("noise", [0.0, 6.0])
 @pytest.mark.parametrize("extent", [0.5, 0.15])
 def test_objects_are_found_with_their_angles_also_where_they_rest(extent, noise):
@@ -42,6 +60,7 @@ def test_velocities_by_flow_are_those_of_the_motion():
     velocity, expected = flow_velocity(frames, track_objects(frames, 2)), np.gradient(truth(poses), axis=0)
     for n in range(2):
         assert np.corrcoef(velocity[:, n, 0], expected[:, n, 0])[0, 1] > 0.9
+        assert np.corrcoef(velocity[:, n, 2], expected[:, n, 2])[0, 1] > 0.2
     assert np.abs(velocity - expected)[..., :2].mean() < 0.4 * np.abs(expected[..., :2]).mean()
 
 
@@ -61,9 +80,14 @@ def test_an_object_that_is_hidden_is_interpolated():
     frames = film(poses, SIZE)
     hidden = slice(20, 25)
     frames[hidden] = film(poses[hidden], SIZE, bodies=[0])
+    x, y = truth(poses)[22, 1, :2].astype(int)
+    frames[hidden, y : y + 3, x : x + 3] = COLORS[1]  # a rest of it is seen
     tracks = track_objects(frames, 2)
     assert tracks.found[:, 0].all() and np.flatnonzero(~tracks.found[:, 1]).tolist() == list(range(20, 25))
     assert np.abs(tracks.pose - truth(poses))[hidden, :, :2].max() < 3
+    velocity = flow_velocity(frames, tracks)[:, 1]
+    np.testing.assert_allclose(np.diff(velocity[20:25], 2, axis=0), 0, atol=1e-9)
+    assert velocity[20:25, 0].min() > 0.1
 
 
 def test_an_object_that_leaves_for_most_of_the_film_is_still_an_object():
@@ -79,6 +103,16 @@ def test_the_order_of_the_objects_is_the_chosen_one():
     assert np.array_equal(heights["lowest"], heights["brightest"][::-1])
     labels = track_objects(frames, 2, sort="brightest").labels
     assert frames[labels == 1].mean() > frames[labels == 2].mean()
+    area = np.median(track_objects(frames, 2, sort="largest").area, axis=0)
+    assert area[0] > area[1]
+
+
+def test_what_rests_is_no_object_though_it_has_the_colour():
+    poses = make_poses()
+    frames = film(poses, SIZE, bodies=[0])
+    frames[:, :16, :16] = COLORS[0]  # larger than the object
+    tracks = track_objects(frames)
+    assert np.abs(tracks.pose[:, 0] - truth(poses)[:, 0])[:, :2].max() < 1.5
 
 
 @pytest.mark.parametrize("n", [0, 1])

@@ -16,5 +16,16 @@ def test_windows_are_pieces_of_episodes():
     assert (windows["e"] == windows["e"][:, :1]).all()
     assert (windows["t"][::2, 0] == 0).all()
     assert len(windows["t"][1::2, 0].unique()) > 4
+    assert sample_windows(episodes, 2, 20, torch.Generator()).shape == (2, 20)
     with pytest.raises(ValueError, match="21"):
         sample_windows(episodes, 2, 21, torch.Generator())
+
+
+def test_every_start_is_drawn_and_a_part_is_that_of_the_whole_batch():
+    episodes = TensorDict({"t": torch.arange(20).expand(5, 20)}, [5, 20])
+    whole, part = (
+        sample_windows(episodes, 64, 18, torch.Generator().manual_seed(0), part)["t"]
+        for part in (slice(None), slice(1, None, 2))
+    )
+    assert set(whole[:, 0].tolist()) == {0, 1, 2}
+    assert torch.equal(part, whole[1::2])

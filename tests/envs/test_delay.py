@@ -50,6 +50,13 @@ def test_an_environment_may_use_its_buffer_again():
     assert [env.step(0)[0].item() for _ in range(4)] == [0, 0, 1, 2]
 
 
+def test_a_caller_may_change_the_frames_that_arrive():
+    env = DelayFrames(Counter(), FrameDelay(3))
+    _, info = env.reset(seed=0)
+    info["arrived"][0][:] = 99
+    assert env.step(0)[0].item() == 0
+
+
 def test_the_wrapper_needs_a_delay_and_a_frame():
     with pytest.raises(ValueError, match="FrameDelay"):
         DelayFrames(Counter(), 6)
@@ -107,6 +114,7 @@ def test_a_wrong_clock_changes_the_reported_delays_alone(error):
         assert frame == same and list(arrived.values()) == list(elsewhere.values())
         assert reported == age + (error if age < t else 0)
         assert list(elsewhere) == [age + (error if age < t else 0) for age in arrived]
+    assert [FrameDelay(4, 1, error=error).longest for error in (-2, 0, 3)] == [5, 5, 8], "true or reported"
     with pytest.raises(ValueError, match="error must be at least -3"):
         FrameDelay(4, 1, error=-4)
 
@@ -117,6 +125,17 @@ def test_rates_are_those_of_the_settings():
     assert 0.08 < draws.count(None) / 5000 < 0.12
     counts = [draws.count(d) for d in range(4, 9)]
     assert sum(counts) + draws.count(None) == 5000 and min(counts) > 800
+
+
+def test_lost_frames_do_not_change_the_delays_of_the_others():
+    plain, lossy = (
+        [delay.draw(generator) for _ in range(50)]
+        for delay, generator in (
+            (FrameDelay(4, 3), make_generator(0)),
+            (FrameDelay(4, 3, 0.3), make_generator(0)),
+        )
+    )
+    assert None in lossy and all(b in (a, None) for a, b in zip(plain, lossy, strict=True))
 
 
 def test_the_seed_of_a_reset_determines_the_delays():

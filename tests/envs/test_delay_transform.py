@@ -120,6 +120,12 @@ def test_each_episode_of_a_long_rollout_begins_with_its_own_first_frame(monkeypa
     assert not torch.equal(out["pixels"][:, 6], out["pixels"][:, 7])
 
 
+def test_without_delay_every_episode_begins_with_its_own_first_frame():
+    env = make_env(FrameDelay())
+    env.rollout(3)
+    assert torch.equal(env.reset()["pixels"], env.base_env._observation["pixels"])
+
+
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*use of fork")
 def test_around_environments_in_processes_of_their_own():

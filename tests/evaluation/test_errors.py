@@ -32,7 +32,16 @@ def test_prediction_errors_are_means_over_steps_with_a_prediction(episodes):
     by_entry = prediction_errors(model, episodes, batch=2, by_entry=True)
     entries = [by_entry[f"error_position_{i}"] for i in range(6)]
     torch.testing.assert_close(torch.tensor(entries), error, rtol=1e-3, atol=1e-4)
-    assert 0 < found["error_rgb"] < 1
+
+
+@torch.no_grad()
+def test_rgb_errors_are_means_of_those_of_single_frames(episodes):
+    model, episodes = make_model().eval(), episodes.clone()
+    episodes["pixels"][0] = 255  # frames whose errors are unlike
+    states = model.predict(model.encode(episodes["pixels"], mixed=True), episodes["action"])
+    error = (model.decode_pixels(*states) - episodes["pixels"] / 255)[:, [1, 11]]
+    expected = error.square().mean((-3, -2, -1)).sqrt().mean().item()
+    assert prediction_errors(model, episodes)["error_rgb"] == pytest.approx(expected, rel=1e-4)
 
 
 def test_policy_errors_leave_disturbed_steps_out_of_the_loss(episodes):

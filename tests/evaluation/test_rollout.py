@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
+from dynmap_rl.data.recording.plans import draw_pushes
 from dynmap_rl.envs.delay import FrameDelay
 from dynmap_rl.envs.renderer import Renderer
 from dynmap_rl.envs.scene import scene_seeds
@@ -96,14 +98,39 @@ def test_rows_say_what_happened(rolled):
         assert row["localization_error"] > 0
 
 
+def test_errors_of_the_predicted_position_by_hand():
+    goal, position = torch.zeros(1, 4, 2), torch.zeros(1, 4, 6)
+    predicted = position.clone()
+    position[0, :, 0] = torch.tensor([0.5, 0.4, 0.3, 0.05])  # the last step is near the goal
+    predicted[0, :, 0] = torch.tensor([9.0, 0.41, 0.32, 0.08])
+    flags = {name: torch.zeros(1, 4, 1, dtype=torch.bool) for name in ("dropped", "touched", "is_success")}
+    data = {"goal": goal, "dynamics": {"position": position}, "predicted_dynamics": {"position": predicted}}
+    data["next"] = flags | {"position_error": torch.zeros(1, 4, 1)}
+    [row] = episode_rows(TensorDict(data, [1, 4]), [7])
+    assert row["localization_error"] == pytest.approx(0.02)
+    assert row["localization_error_away"] == pytest.approx(0.015)
+
+
+@torch.no_grad()
+def test_predictions_are_those_of_the_frames_and_actions():
+    actor = make_actor().eval()
+    found = roll_out(actor, "balance_reaching", scene_seeds("validation", 2), keep_pixels=True)
+    states = actor.world_model.predict(actor.world_model.encode(found["pixels"], mixed=True), found["action"])
+    expected = actor.world_model.decode_dynamics(*states)["position"]
+    predicted = found["predicted_dynamics", "position"]
+    torch.testing.assert_close(predicted[:, 1:], expected[:, 1:], rtol=1e-3, atol=1e-3)
+    assert not predicted[:, 0].any()
+
+
 def test_pushes_act_on_the_cart_but_the_actor_is_not_told():
-    seeds = scene_seeds("validation", 2)
+    seeds, count = scene_seeds("validation", 2), get_task("balance_reaching").pushes
     plain, pushed, again = (
         roll_out(make_actor(), "balance_reaching", seeds, pushed=pushed) for pushed in (False, True, True)
     )
     assert torch.equal(pushed["action"], again["action"])
     other = ((plain["action"] - pushed["action"]).abs() > 1e-4).any(-1)
     first = other.float().argmax(1)
+    assert first.tolist() == [draw_pushes(seed, count)[0][0] for seed in seeds]
     assert other.any(1).all() and other.sum() < other.numel()
     for row, t in enumerate(first.tolist()):
         before = [plain["dynamics", "position"][row, : t + 1], pushed["dynamics", "position"][row, : t + 1]]

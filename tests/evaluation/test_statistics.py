@@ -29,6 +29,18 @@ def test_rates_are_percentages_and_the_error_is_in_mm():
     assert summary["PE"] == pytest.approx(20.0)
 
 
+def test_every_entry_of_a_summary_is_that_of_its_own_column():
+    made = rows(3, dropped=1, count=4)
+    for row, error, cause in zip(made, (0.01, 0.01, 0.01, 0.09), "baac", strict=True):
+        row |= {"position_error": error, "touched": row["scene_seed"] < 2, "cause": cause}
+        row |= {"localization_error": 0.01, "localization_error_away": 0.02}
+    found = summarize(made)
+    assert found["PE"] == pytest.approx(30.0) and found["touched"] == 50.0
+    assert (found["DR_interval"], found["SR_interval"]) == (wilson(1, 4), wilson(3, 4))
+    assert (found["localization"], found["localization_away"]) == pytest.approx((10.0, 20.0))
+    assert list(found["causes"].items()) == [("a", 2), ("b", 1), ("c", 1)]
+
+
 def test_students_interval_is_that_of_scipy_within_0_and_100():
     rates = [50.0, 60.0, 70.0]
     expected = ttest_1samp(rates, 0).confidence_interval(0.95)
@@ -63,6 +75,13 @@ def test_seeds_that_agree_say_no_more_than_one():
         assert shared_interval(seeds) == pytest.approx(wilson(rate / 3, 100))
 
 
+def test_seeds_that_complement_each_other_count_as_independent_at_most():
+    even = [dict(row, success=i % 2 == 0) for i, row in enumerate(rows(0, dropped=30, count=100))]
+    odd = [dict(row, success=i % 2 == 1 or i == 0) for i, row in enumerate(even)]
+    assert shared_interval([even, odd]) == pytest.approx(wilson(101, 200))
+    assert shared_interval([even] * 3, "dropped") == pytest.approx(wilson(30, 100))
+
+
 def test_shared_interval_holds_the_rate_as_often_as_it_says():
     """Start states are easy or hard for all three policies. One that takes all episodes for independent is too narrow."""
     rng, held, held_by_wilson = np.random.default_rng(0), [], []
@@ -89,6 +108,11 @@ def test_gap_is_paired_and_has_an_interval():
     assert result["interval"][0] < 20 < result["interval"][1]
     same = rate_gap([rows(5)], [rows(5)])
     assert same == {"gap": 0.0, "interval": (0.0, 0.0), "p": 1.0}
+
+
+def test_gap_does_not_depend_on_how_often_a_seed_counts():
+    a, b = rows(6), rows(0)
+    assert rate_gap([a, a], [b])["gap"] == rate_gap([a], [b, b, b])["gap"] == pytest.approx(60.0)
 
 
 def test_p_is_that_of_a_sign_test_where_each_start_state_has_one_outcome():

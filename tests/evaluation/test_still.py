@@ -27,6 +27,16 @@ def test_only_frames_that_changed_are_encoded(monkeypatch):
 
 
 @torch.no_grad()
+def test_a_latent_that_was_returned_stays_as_it_is():
+    still, frames = StillEncoder(make_model().eval().encoder), draw(2, 0)
+    first = still(frames)
+    kept, other = first.clone(), frames.clone()
+    other[0] = 200
+    still(other)
+    assert torch.equal(first, kept)
+
+
+@torch.no_grad()
 def test_the_encoder_comes_back(tmp_path):
     model = make_model()
     encoder, names = model.encoder, list(model.state_dict())

@@ -37,18 +37,20 @@ def new_policy(recording, episodes=None, **settings):
 
 
 def test_windows_are_those_of_our_own_loader(recording):
-    policy = new_policy(recording)
-    batch = load_windows(recording, policy, [0, 130, 237])  # the last goes 3 steps beyond its episode
+    policy, episodes = new_policy(recording), load_dataset(recording)
+    pushed = int(episodes["disturbed"][1].flatten().int().argmax())  # in the first step of the second window
+    batch = load_windows(
+        recording, policy, [0, 120 + pushed, 237]
+    )  # the last goes 3 steps beyond its episode
     windows = policy.make_windows(batch)
-    episodes = load_dataset(recording)
-    assert windows.shape == (3, 6)
+    assert windows.shape == (3, 6) and windows["disturbed"][1, 0]
     for row, episode, steps in (
         (0, 0, range(6)),
-        (1, 1, range(10, 16)),
+        (1, 1, range(pushed, pushed + 6)),
         (2, 1, [117, 118, 119, 119, 119, 119]),
     ):
         expected = episodes[episode][list(steps)]
-        for key in ("pixels", "action", "goal", "dynamics"):
+        for key in ("pixels", "action", "expert_action", "goal", "dynamics"):
             assert (windows[row][key] == expected[key]).all(), key
         assert torch.equal(windows["disturbed"][row], expected["disturbed"])
         there = [row != 2 or step < 3 for step in range(6)]
@@ -87,6 +89,19 @@ def test_the_loss_is_that_of_the_config(recording, supervision, kind, terms):
     assert set(parts) == {f"loss_{term}" for term in terms}
     assert loss.item() == pytest.approx(sum(parts.values()), rel=1e-5)
     assert all(p.grad is not None for p in policy.parameters())
+
+
+@pytest.mark.parametrize("recolor", [False, True])
+@pytest.mark.parametrize("symmetric", [False, True])
+def test_windows_of_a_symmetric_scene_are_mirrored_and_shifted(recording, symmetric, recolor):
+    policy = new_policy(recording, symmetric=symmetric, recolor=recolor)
+    windows = policy.make_windows(load_windows(recording, policy, range(0, 80, 10)))
+    torch.manual_seed(0)
+    changed = policy._augment(windows)
+    assert torch.equal(changed["pixels"], windows["pixels"]) is not (symmetric or recolor)
+    mirrored = (changed["action"] != windows["action"]).any((1, 2))
+    shifted = (changed["goal"][..., 1] != windows["goal"][..., 1]).any(1)
+    assert mirrored.any() == shifted.any() == symmetric
 
 
 def test_constants_are_those_of_the_recording_and_are_saved(recording, tmp_path):

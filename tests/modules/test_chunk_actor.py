@@ -89,13 +89,14 @@ def test_the_first_actions_are_those_that_the_robot_executes_meanwhile(kind):
 
 
 def test_an_earlier_step_begins_a_new_episode():
-    actor, (pixels, goal) = make_actor("recurrent"), draw(1)
-    chunks = ChunkActor(actor, size=4, delay=1)
-    first = chunks.act(pixels[0], goal, step=0)
-    chunks.act(pixels[0], goal, step=2)
-    assert torch.equal(chunks.act(pixels[0], goal, step=0), first)
+    actor, (pixels, goal) = make_actor("recurrent"), draw(2)
+    chunks, fresh = ChunkActor(actor, size=6, delay=3), ChunkActor(actor, size=6, delay=3)
+    for step in (0, 2):
+        chunks.act(pixels[0], goal, step=step)
+    first = fresh.act(pixels[1], goal, step=0)  # its frame is another than in the episode before
+    assert torch.equal(chunks.act(pixels[1], goal, step=0), first)
     # A robot that waited longer than a chunk goes on with its memory.
-    assert not torch.allclose(chunks.act(pixels[0], goal, step=9), first)
+    assert not torch.allclose(chunks.act(pixels[1], goal, step=9), first)
 
 
 @pytest.mark.parametrize(("size", "delay"), [(4, 4), (4, -1), (0, 0)])

@@ -174,6 +174,16 @@ def test_history_is_cleared_where_an_episode_begins():
         assert not torch.equal(out[key][1], fresh[key][1]), key
 
 
+@torch.no_grad()
+def test_a_call_leaves_the_history_that_it_reads():
+    actor, frames = DelayedActor(make_actor(), max_delay=3), make_frames()
+    memory = run(actor, send(frames, [[0], [1], [], [2]]))[:, -1]["next"]
+    kept = memory["history"].clone()
+    entries = {"goal": GOAL, "pixels": frames[:, 5], "delay": torch.ones(2, 1, dtype=torch.int64)}
+    actor(memory.copy().update(entries))
+    assert (memory["history"] == kept).all()
+
+
 DELAY = FrameDelay(3, 2, 0.2)
 
 

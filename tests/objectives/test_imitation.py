@@ -7,7 +7,7 @@ from tensordict import TensorDict
 
 from dynmap_rl.modules.checkpoints import make_policy
 from dynmap_rl.modules.normalization import Normalizer
-from dynmap_rl.objectives.imitation import ImitationLoss, imitation_loss
+from dynmap_rl.objectives.imitation import ImitationLoss, find_target, imitation_loss
 
 
 def test_the_loss_is_the_mean_absolute_error_in_normalised_units():
@@ -17,15 +17,21 @@ def test_the_loss_is_the_mean_absolute_error_in_normalised_units():
 
 
 def test_emphasis_weighs_the_steps_in_which_the_action_changes():
-    normalizer = Normalizer([-1.0], [1.0])
-    action = torch.tensor([[[0.0], [0.5], [0.5]]])
-    wrong_at = [torch.zeros(1, 3, 1).index_fill(1, torch.tensor([t]), 1.0) for t in range(3)]
+    normalizer = Normalizer([-2.0], [2.0])  # the change counts in normalised units, as the error does
+    action = torch.tensor([[[0.0], [1.0], [1.0]]])
+    wrong_at = [torch.zeros(1, 3, 1).index_fill(1, torch.tensor([t]), 2.0) for t in range(3)]
     losses = [imitation_loss(action + error, action, normalizer, emphasis=4.0).item() for error in wrong_at]
     assert losses == pytest.approx([0.2, 0.6, 0.2])  # weights 1, 1 + 4 / 2, 1
     from_the_start = [
-        imitation_loss(action + e + 0.5, action + 0.5, normalizer, emphasis=4.0) for e in wrong_at
+        imitation_loss(action + e + 1.0, action + 1.0, normalizer, emphasis=4.0) for e in wrong_at
     ]
     assert from_the_start[0] == from_the_start[1] > from_the_start[2]
+
+
+def test_the_loss_is_divided_by_the_given_total():
+    action, normalizer = torch.zeros(1, 4, 1), Normalizer([-1.0], [1.0])
+    loss = imitation_loss(action + 1, action, normalizer, total=lambda weight: 2 * weight)
+    assert loss.item() == pytest.approx(0.5)
 
 
 def test_ignored_steps_do_not_count_with_emphasis():
@@ -53,6 +59,21 @@ def test_ignored_steps_may_be_nan(ignore, emphasis):
     loss.backward()
     assert loss == (0.0 if all(ignore) else 0.5)
     assert predicted.grad.isfinite().all()
+
+
+def test_what_the_demonstrator_wanted_is_imitated_in_every_step():
+    td = TensorDict({"action": torch.zeros(1, 2, 3), "expert_action": torch.ones(1, 2, 3)}, [1, 2])
+    td["disturbed"] = torch.ones(1, 2, 1, dtype=torch.bool)
+    target, ignore = find_target(td)
+    assert torch.equal(target, td["expert_action"]) and ignore is None
+
+
+def test_disturbed_and_masked_steps_are_both_left_out():
+    td = TensorDict({"action": torch.zeros(1, 3, 3)}, [1, 3])
+    td["disturbed"] = torch.tensor([[[True], [False], [False]]])
+    td["mask"] = torch.tensor([[True, True, False]])
+    target, ignore = find_target(td, masks=("mask",))
+    assert torch.equal(target, td["action"]) and ignore.flatten().tolist() == [True, False, True]
 
 
 def test_the_module_is_the_function_of_the_policys_actions():

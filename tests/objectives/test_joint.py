@@ -33,17 +33,20 @@ def test_end_to_end_trains_encoder_transition_and_policy_by_the_policys_loss(td,
     losses["loss_policy"].backward()
     assert moved(model.encoder) and moved(model.transition.lstm) and moved(policy)
     assert not moved(model.image_decoder) and not moved(model.dynamics_decoder)
+    model.zero_grad()
+    loss(td[:, :1])["loss_policy"].backward()  # by the latent alone: hidden states begin as zeros
+    assert moved(model.encoder)
 
 
 def test_joint_is_the_world_model_loss_and_the_weighted_policy_loss(td):
-    loss, model, policy = make(beta_joint=3.0)
+    loss, model, policy = make(beta_joint=3.0, emphasis=9.0)
     losses = loss(td)
     for name, value in WorldModelLoss(model)(td).items():
         torch.testing.assert_close(losses[name], value)
     latent = model.encode(td["pixels"])
     _, hidden1, hidden2 = model.predict(latent, td["action"])
     predicted = policy(latent, hidden1, hidden2, td["goal"])
-    expected = 3 * imitation_loss(predicted, td["action"], policy.action)
+    expected = 3 * imitation_loss(predicted, td["action"], policy.action, emphasis=9.0)
     torch.testing.assert_close(losses["loss_policy"], expected)
     sum(losses.values()).backward()
     assert all(map(moved, (model.encoder, model.image_decoder, model.dynamics_decoder, policy)))

@@ -94,6 +94,16 @@ def test_the_loss_of_the_dynamics_is_the_mean_over_the_labelled_steps():
     assert none["loss_position"] == 0 and none["loss_latent"] == found["loss_latent"]
 
 
+def test_labels_belong_to_their_own_step():
+    td, (_, loss) = batch(), make(("position",))
+    td["labelled"] = (torch.arange(5) == 2).expand(2, 5)[..., None]
+    expected = loss(td)["loss_position"].item()
+    td["dynamics", "position"][:, [1, 3, 4]] += 1.0
+    assert loss(td)["loss_position"].item() == pytest.approx(expected)
+    td["dynamics", "position"][:, 2] += 1.0
+    assert loss(td)["loss_position"].item() != pytest.approx(expected)
+
+
 def test_without_the_rgb_loss_no_frame_is_decoded():
     model, loss = make(("position",), beta_rgb=0.0)
     model.decode_pixels = None
@@ -134,6 +144,20 @@ def test_imagined_windows_read_no_frames_after_their_context():
     first = seen(td)["loss_position"].item()
     td["pixels"][:, -2] = 0
     assert seen(td)["loss_position"].item() != first
+
+
+def test_only_the_first_windows_are_imagined_and_from_any_step_on(monkeypatch):
+    td, contexts = batch(t=6), set()
+    td["labelled"] = torch.tensor([False, True])[:, None, None].expand(2, 6, 1)
+    model, loss = make(("position",), imagined=0.5, generator=torch.Generator().manual_seed(0))
+    seen = WorldModelLoss(model)(td)["loss_position"].item()
+    imagine = model.transition.imagine
+    monkeypatch.setattr(
+        model.transition, "imagine", lambda z, action, n: contexts.add(n) or imagine(z, action, n)
+    )
+    for _ in range(40):
+        assert loss(td)["loss_position"].item() == pytest.approx(seen, rel=1e-4)
+    assert contexts == {1, 2, 3, 4, 5}
 
 
 def test_the_latent_loss_of_imagined_windows_moves_the_predicted_change_alone():

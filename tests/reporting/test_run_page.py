@@ -5,9 +5,9 @@ import pytest
 import torch
 from small import CONSTANTS, make_episodes, make_model
 
-from dynmap_rl.evaluation.protocol import judge_in_closed_loop
+from dynmap_rl.evaluation.protocol import judge_in_closed_loop, unpack_rows
 from dynmap_rl.evaluation.settings import Evaluation
-from dynmap_rl.evaluation.statistics import summarize
+from dynmap_rl.evaluation.statistics import shared_interval, summarize
 from dynmap_rl.modules.checkpoints import make_policy, save_policy
 from dynmap_rl.reporting.run_page import row_text, write_report
 from dynmap_rl.utils.files import read_json, write_json
@@ -52,6 +52,9 @@ def test_the_result_collects_the_seeds(run, recording):
             name
         )
     assert result["test_protocol"]["episodes"] == 4
+    rows = [unpack_rows(seed["test"]["rows"]) for seed in result["results"]]
+    for name, outcome in (("SR", "success"), ("DR", "dropped")):
+        assert result["test_protocol"][f"{name}_interval"] == shared_interval(rows, outcome)
     page = (run[0] / "report.html").read_text()
     assert "world_model.seed" in page and "89 (0.9)" in page and page.count("data:image/") == 3
     assert {path.name for path in (run[0] / "figures").iterdir()} == {"reconstruction.png", "dynamics.png"}

@@ -9,6 +9,7 @@ from tensordict.nn import TensorDictModule
 from dynmap_rl.data.features import compute_features
 from dynmap_rl.data.recording.plans import Plan, roll_out
 from dynmap_rl.envs.scene import scene_seed
+from dynmap_rl.envs.world import LARGEST_CHANGE
 from dynmap_rl.experts.network import list_checkpoints
 from dynmap_rl.modules.actor import Actor
 from dynmap_rl.modules.checkpoints import make_policy
@@ -43,7 +44,7 @@ def test_a_student_that_acts_like_the_expert_is_not_corrected():
     assert not corrected["failed"].any()
 
 
-def test_steps_after_a_failure_are_marked():
+def test_steps_after_a_failure_are_marked_and_actions_are_those_that_a_cart_can_execute():
     """Full acceleration to one side drops the block; the expert would have done something else."""
     actions = torch.zeros(1, 120, 3)
     actions[:, :, 0] = 0.04 * torch.from_numpy(np.sign(np.sin(np.arange(120) / 4))).float()
@@ -51,6 +52,9 @@ def test_steps_after_a_failure_are_marked():
     failed = corrected["failed"][0, :, 0]
     assert not failed[0] and failed[-1] and failed.int().diff().min() == 0
     assert not torch.equal(corrected["action"], corrected["expert_action"])
+    for key in ("action", "expert_action"):
+        change = corrected[key][:, 1:] - corrected["action"][:, :-1]
+        assert (change.abs() <= torch.from_numpy(LARGEST_CHANGE) + 1e-6).all(), key
 
 
 def test_corrections_join_the_states_and_steps_after_a_failure_are_left_out():

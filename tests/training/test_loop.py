@@ -1,6 +1,7 @@
 """The loop over windows: it resumes to the same weights, and stops before a bad state is saved."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -82,6 +83,29 @@ def test_a_loss_that_is_not_finite_or_diverges_keeps_the_last_state(tmp_path, mo
     error, state = train_from(10, change, tmp_path, monkeypatch)
     assert message in error
     assert state["update"] == 10 and all(value.isfinite().all() for value in state["model"].values())
+
+
+def test_a_resumed_training_still_knows_its_first_loss(tmp_path, monkeypatch):
+    train_world_model(make_model(), make_episodes(), tmp_path, replace(WORLD_MODEL, updates=10))
+    sample = loop.sample_windows
+    monkeypatch.setattr(loop, "sample_windows", lambda *args: exploding(sample(*args)))
+    with pytest.raises(ValueError, match="diverges"):
+        train_world_model(make_model(), make_episodes(), tmp_path, replace(WORLD_MODEL, updates=20))
+
+
+def test_the_learning_rate_warms_up_and_falls_to_2_percent():
+    optimizer, rates = SimpleNamespace(param_groups=[{}]), []
+    for update in range(1000):
+        loop.set_learning_rate(optimizer, 1.0, update, 1000)
+        rates.append(optimizer.param_groups[0]["lr"])
+    assert rates[0] == pytest.approx(0.01) and rates[49] == pytest.approx(0.5, abs=0.01)
+    assert rates[500] == pytest.approx(0.51) and rates[-1] == pytest.approx(0.02, abs=1e-4)
+
+
+def test_gradients_are_clipped_to_a_norm_of_1():
+    parameter = torch.nn.Parameter(torch.zeros(4))
+    norm = loop.step((30 * parameter).sum(), torch.optim.SGD([parameter], 1.0))
+    assert norm == 60 and parameter.norm().item() == pytest.approx(1.0)
 
 
 def test_a_learning_rate_that_is_too_high_stops_before_anything_is_saved(tmp_path, monkeypatch):

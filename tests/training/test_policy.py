@@ -1,10 +1,12 @@
 """Training of a policy on the states of a frozen world model."""
 
 import pytest
+import torch
 from small import CONSTANTS, POLICY, make_episodes, make_model
 
 from dynmap_rl.data.features import compute_features
 from dynmap_rl.modules.checkpoints import make_policy
+from dynmap_rl.objectives.imitation import ImitationLoss
 from dynmap_rl.runs.folder import read_metrics
 from dynmap_rl.training import train_policy
 from dynmap_rl.utils.weights import fingerprint
@@ -29,6 +31,9 @@ def test_the_policy_learns_and_the_world_model_stays(tmp_path, model, features, 
     assert fingerprint(policy) != untrained
     [row] = read_metrics(tmp_path / "new")
     assert row["step"] == POLICY.updates and row.keys() == {"step", "loss", "held_out_loss"}
+    with torch.no_grad():
+        plain = ImitationLoss(policy)(features)["loss_policy"].item()  # without the emphasis of the training
+    assert row["held_out_loss"] == pytest.approx(plain, rel=0.02)
 
 
 def test_a_loss_that_is_not_finite_stops_the_training(tmp_path, model, features):

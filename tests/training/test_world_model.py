@@ -7,6 +7,7 @@ import pytest
 import torch
 from small import CONSTANTS, WORLD_MODEL, make_episodes, make_model
 
+from dynmap_rl.data.settings import Augmentation
 from dynmap_rl.runs.folder import read_metrics
 from dynmap_rl.training import (
     WorldModelArchitecture,
@@ -49,6 +50,7 @@ def test_errors_of_every_entry_on_request(tmp_path):
         {"rgb_frames": 1},
         {"beta_rgb": 0.5},
         {"labelled": 0.4},
+        {"augmentation": Augmentation.off()},
     ],
 )
 def test_every_setting_has_an_effect(tmp_path, changes):

@@ -1,0 +1,23 @@
+"""Tables of a dataset and its division into episodes for training and held-out ones."""
+
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from dynmap_rl.data.format.reading import choose_splits, read_table
+
+
+def test_every_tenth_episode_is_held_out():
+    splits = choose_splits(Path(), {}, list(range(25)))
+    assert splits["eval"] == [9, 19] and splits["train"] == [e for e in range(25) if e not in (9, 19)]
+
+
+def test_rows_are_in_order_of_time(tmp_path):
+    (tmp_path / "data/chunk-000").mkdir(parents=True)
+    for number, index in enumerate(([2, 3], [0, 1])):
+        table = pa.table({"index": index, "episode_index": [0, 0]})
+        pq.write_table(table, tmp_path / f"data/chunk-000/file-{number:03}.parquet")
+    info = {"total_frames": 4, "features": {}}
+    assert read_table(tmp_path, info, [])["index"].to_pylist() == [0, 1, 2, 3]
+    assert read_table(tmp_path, info, [], by_time=False)["index"].to_pylist() == [2, 3, 0, 1]
