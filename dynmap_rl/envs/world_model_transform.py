@@ -25,7 +25,7 @@ class WorldModelTransform(Transform):
 
     Args:
         world_model: world model that encodes and predicts.
-        pixels: key of the frames ``[..., 3, 64, 64]``, which is read.
+        pixels: key of the frames ``[..., 3, S, cameras * S]``, which is read.
         action: key of the actions ``[..., A]`` (SI units), which is read.
         latent: key of the latent ``[..., Z]``, which is written.
         predicted_latent: key of the predicted latent ``[..., Z]``, which is written.

@@ -135,7 +135,7 @@ class Actor(TensorDictModuleBase):
     memory; :meth:`predict` writes ``predicted_latent`` and the world model's next memory from ``action``. Where the
     TensorDict has no ``pixels``, the predicted latent takes the frame's place: the actor imagines.
 
-    It reads ``pixels`` ``[..., 3, 64, 64]``, ``goal`` ``[..., G]`` and the memories at t; it writes ``action``
+    It reads ``pixels`` ``[..., 3, S, cameras * S]``, ``goal`` ``[..., G]`` and the memories at t; it writes ``action``
     ``[..., A]`` and ``latent`` at t and, under ``next``, the memories and ``predicted_latent`` at t + 1. Memories are
     zero where they are absent and where ``is_init`` (optional, ``[..., 1]``) is true.
 

@@ -42,7 +42,7 @@ class ChunkActor:
         """Return the chunk ``[B, size, A]`` (SI units) that begins at the step of a frame.
 
         Args:
-            pixels: frames uint8 ``[B, 3, 64, 64]``.
+            pixels: frames uint8 ``[B, 3, S, cameras * S]``.
             goal: goals ``[B, G]`` (SI units).
             step: number of the step before which the frames were taken, from 0. A step before that of the last call
                 begins a new episode, as does :meth:`reset`. By default, the whole last chunk has been executed since the last frame.

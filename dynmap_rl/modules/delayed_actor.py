@@ -29,7 +29,7 @@ class DelayedActor(TensorDictModuleBase):
     It reads and writes what ``actor`` does, except that the world model's memory is now an output, the estimate of the
     present, and that ``history``, a TensorDict, is read at t and written under ``next``. It also reads ``delay`` int64
     ``[..., 1]``: the number of steps since the frame in ``pixels`` was taken. Several frames that arrive in the same
-    step have one more axis, ``pixels`` ``[..., M, 3, 64, 64]`` and ``delay`` ``[..., M]``, in any order. A negative delay
+    step have one more axis, ``pixels`` ``[..., M, 3, S, cameras * S]`` and ``delay`` ``[..., M]``, in any order. A negative delay
     marks a place without a frame, and frames from before the episode are not used. Of several frames of one step, the last
     is used.
     :class:`dynmap_rl.envs.DelayTransform` writes both entries. Without ``delay`` in the TensorDict, every frame is as old

@@ -22,7 +22,7 @@ class WorldModelLoss(LossModule):
     (not its square), divided by the square root of the number of entries. Frames, latents and dynamics then have one
     scale.
 
-    Input: ``pixels`` uint8 ``[B, T, 3, 64, 64]``, ``action`` ``[B, T, A]`` and, for every supervised quantity,
+    Input: ``pixels`` uint8 ``[B, T, 3, S, cameras * S]``, ``action`` ``[B, T, A]`` and, for every supervised quantity,
     ``("dynamics", quantity)`` ``[B, T, D]``, in SI units. Optional: a mask of valid steps, bool ``[B, T]`` or
     ``[B, T, 1]``, under ``loss_mask_key`` of :class:`torchrl.objectives.LossModule`, by default
     ``("collector", "mask")``; invalid steps are left out. Also optional: ``labelled``, bool ``[B, T]`` or ``[B, T, 1]``,

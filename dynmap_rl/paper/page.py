@@ -73,7 +73,7 @@ worth about 50 points there ([table](#tables-of-our-own)).
 ## Every column
 
 SR and DR in %, PE in mm. By the paper's protocol: mean and standard deviation over all policies, 50 episodes each. On the
-shared start states: all policies of all world models on the same 1,000 scenes.
+test scenes: all policies of all world models on the same 1,000 scenes.
 
 Two intervals of 95 % stand in brackets. That over scenes is Wilson's for the effective number of independent episodes,
 since a scene that is hard for one policy is hard for the others. It says nothing about further trainings. That over world

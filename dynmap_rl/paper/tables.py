@@ -47,7 +47,7 @@ def table_rows(cells: Mapping[Key, Cell]) -> list[dict]:
 
 
 def markdown_overview(cells: Mapping[Key, Cell]) -> str:
-    """Return SR (%) of the paper's tables as one table: the paper's / ours on the 1,000 shared start states."""
+    """Return SR (%) of the paper's tables as one table: the paper's / ours on the 1,000 test scenes."""
     columns = [column for columns in COLUMNS.values() for column in columns]
     lines = []
     for row in ROWS:
@@ -70,7 +70,7 @@ def markdown_column(cells: Mapping[Key, Cell], column: tuple[str, str, str]) -> 
         column: task, training and policy.
 
     Returns:
-        The paper's numbers, ours by its protocol, and ours on the 1,000 shared start states, with what is missing and
+        The paper's numbers, ours by its protocol, and ours on the 1,000 test scenes, with what is missing and
         the commits below.
     """
     own, others = [cells[*column, row] for row in ROWS if (*column, row) in cells], _others(column[0])
@@ -110,7 +110,7 @@ def markdown_own(cells: Mapping[Key, Cell], table: str) -> str:
 
 def markdown_tables(cells: Mapping[Key, Cell]) -> str:
     """Return the overview, every column of the paper's tables under its name, and the tables of our own."""
-    parts = [f"SR in %, the paper's / ours on the 1,000 shared start states\n\n{markdown_overview(cells)}"]
+    parts = [f"SR in %, the paper's / ours on the 1,000 test scenes\n\n{markdown_overview(cells)}"]
     for table, columns in COLUMNS.items():
         for column in columns:
             parts.append(f"Table {table}, {_name(column)}\n\n{markdown_column(cells, column)}")
