@@ -84,6 +84,7 @@ def test_an_object_that_is_hidden_is_interpolated():
     frames[hidden, y : y + 3, x : x + 3] = COLORS[1]  # a rest of it is seen
     tracks = track_objects(frames, 2)
     assert tracks.found[:, 0].all() and np.flatnonzero(~tracks.found[:, 1]).tolist() == list(range(20, 25))
+    assert not tracks.area[hidden, 1].any()
     assert np.abs(tracks.pose - truth(poses))[hidden, :, :2].max() < 3
     velocity = flow_velocity(frames, tracks)[:, 1]
     np.testing.assert_allclose(np.diff(velocity[20:25], 2, axis=0), 0, atol=1e-9)
