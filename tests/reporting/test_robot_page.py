@@ -30,7 +30,9 @@ def write(folder, episodes, **options):
 
 
 def test_errors_are_means_over_seeds_beside_those_of_the_best_constant(folder, monkeypatch):
-    monkeypatch.setattr(robot_page, "describe_robot_dataset", lambda *_: {"names": NAMES})
+    described, drawn = {"names": NAMES, "info": {"fps": 10}}, []
+    monkeypatch.setattr(robot_page, "describe_robot_dataset", lambda *_: described)
+    monkeypatch.setattr("dynmap_rl.reporting.figures.plot_reconstruction", lambda *_, dt: drawn.append(dt))
     episodes = make_episodes()["eval"].set("episode", torch.tensor([4, 4, 7])[:, None, None].expand(3, 12, 1))
     result = write(folder, episodes)
     assert result["held_out"]["rgb"] == pytest.approx(0.2)
@@ -40,7 +42,7 @@ def test_errors_are_means_over_seeds_beside_those_of_the_best_constant(folder, m
     values = episodes["action"].flatten(0, 1)[:, 1]
     assert result["spread"]["action"]["y"] == pytest.approx((values - values.median()).abs().mean().item())
     assert result["trained_on"]["held_out_episodes"] == [4, 7] and "task" not in result
-    assert read_json(folder / "eval.json")["held_out"] == result["held_out"]
+    assert read_json(folder / "eval.json")["held_out"] == result["held_out"] and drawn == [0.1]
     assert "0.2000" in robot_row_text(result) and "0.2000" in (folder / "report.html").read_text()
     with pytest.raises(ValueError, match="another world model"):
         write(folder, episodes, frozen="seed 0")
