@@ -2,14 +2,18 @@
 
 import dataclasses
 import shutil
+from types import SimpleNamespace
 
 import pytest
 import torch
+from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.policies import make_policy, make_policy_config, make_pre_post_processors
+from robot_dataset import CAMERA, make_robot_dataset
 from tensordict import TensorDict
 
+from dynmap_rl.data import add_dynamics
 from dynmap_rl.data.demonstrations import load_dataset, load_meta
 from dynmap_rl.integrations.lerobot.configuration_dynmap import DynmapConfig
 from dynmap_rl.integrations.lerobot.modeling_dynmap import DynmapPolicy
@@ -190,3 +194,17 @@ def test_wrong_settings_are_refused(settings, message):
 def test_missing_features_are_refused():
     with pytest.raises(ValueError, match="camera"):
         DynmapPolicy(DynmapConfig(**SMALL))
+
+
+def test_a_robot_dataset_is_sent_to_its_own_recipe(tmp_path):
+    add_dynamics(make_robot_dataset(tmp_path / "robot", (12, 12)), tmp_path / "mine", columns=[0, 1])
+    frame, state, action = (
+        PolicyFeature(FeatureType[kind], shape)
+        for kind, shape in (("VISUAL", (3, 64, 64)), ("STATE", (4,)), ("ACTION", (2,)))
+    )
+    features = {
+        "input_features": {CAMERA: frame, "observation.state": state},
+        "output_features": {"action": action},
+    }
+    with pytest.raises(ValueError, match=r"mine must be a recording.*got 2; .*robot\.py"):
+        DynmapPolicy(DynmapConfig(**SMALL, **features), dataset_meta=SimpleNamespace(root=tmp_path / "mine"))
