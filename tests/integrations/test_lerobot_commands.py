@@ -96,7 +96,7 @@ def trained(recording, installed, tmp_path_factory):
     command += [*train_arguments("dynmap", recording, output, 4), "--env.type=dynmap"]
     command += ["--env_eval_freq=4", "--eval.n_episodes=1", "--eval.batch_size=1", "--env.split=validation"]
     # Nothing random in a step: LeRobot restores torch's generator, but then draws from it for its loader.
-    command += ["--policy.recolor=false", "--policy.rgb_frames=12"]
+    command += ["--policy.recolor=false", "--policy.symmetric=false", "--policy.rgb_frames=12"]
     environment = os.environ | {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", "PYTHONPATH": str(installed)}
     done = subprocess.run(
         command, cwd=output.parent, env=environment, capture_output=True, text=True, timeout=400
