@@ -15,7 +15,8 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynmap_rl.utils.cli import command_line, parse_numbers, refuse, run_recipe
+from dynmap_rl.utils.cli import command_line, refuse, run_recipe
+from dynmap_rl.utils.settings import parse_numbers
 
 
 @dataclass(frozen=True)

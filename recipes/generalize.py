@@ -76,7 +76,7 @@ def main(config: Config) -> None:
             f"--task must differ from the task of --pretrained, got {config.task} for both; choose another --task, or "
             "use recipes/decoupled.py"
         )
-    if world_model.transition.action.size != len(task.layout.action_limit):
+    if "task" not in source or world_model.transition.action.size != len(task.layout.action_limit):
         raise ValueError(
             f"--pretrained must be of a task with the actions of {config.task}, got {config.pretrained}"
         )

@@ -106,14 +106,15 @@ def main(config: Config) -> None:
 
 def load_world_models(runs: list[str]) -> dict:
     """Load the world models of runs by the names of their rows."""
+    from dynmap_rl.envs.world import ACTION_LIMIT
     from dynmap_rl.modules.supervision import row_name
     from dynmap_rl.runs.lookup import load_source
 
     models = {}
     for run in runs:
         world_model, source = load_source(run.strip())
-        if world_model.transition.action.size != 3:
-            raise ValueError(f"--runs must be of tasks 1 to 3, got {run}, whose actions are others")
+        if "task" not in source or world_model.transition.action.size != len(ACTION_LIMIT):
+            raise ValueError(f"--runs must be of tasks 1 to 3, got {run}")
         name = f"{row_name(world_model.supervision, source['training'])}, {source['training']}"
         if world_model.architecture != "glimpse":
             name += f", {world_model.architecture}"

@@ -33,6 +33,9 @@ def augment(
         New windows ``[B, T]``.
     """
     batch = windows.shape[0]
+    windows = windows.exclude("agent_pos", "state")
+    if not (mirror or max_shift or recolor):
+        return windows
     # All numbers are always drawn, so that an option does not change what the others draw.
     mirrored = integers(0, 2, (batch,), generator).bool() & mirror
     shift = integers(-max_shift, max_shift + 1, (batch, 2), generator)
@@ -46,7 +49,6 @@ def augment(
     offset = torch.zeros(batch, 1, 3, device=generator.device)
     offset[:, 0, :2] = shift * METERS_PER_PIXEL
     offset[:, 0, 0] += mirrored  # 1 - x
-    windows = windows.exclude("agent_pos", "state")
     windows["pixels"] = _transform_pixels(windows["pixels"], mirrored, shift, channels)
     if not (mirror or max_shift):
         return windows

@@ -89,9 +89,8 @@ def judge_quality(derived: Sequence[Derived]) -> dict:
         ``good``, ``where`` (that object or entry), ``episode`` (the worst one), ``what`` and ``advice``.
     """
     rows: dict[int, dict] = {}  # values by check and place, by episode
-    extents: dict[
-        str, list[float]
-    ] = {}  # of each entry of a state, by episode: entries may have different units
+    # Of each entry of a state, by episode: entries may have different units.
+    extents: dict[str, list[float]] = {}
     for part in derived:
         if part.motion.found is None:
             for name, extent in zip(part.names, _extent(part.position), strict=True):

@@ -13,7 +13,7 @@ import torch
 from tensordict import TensorDict
 
 from dynmap_rl.keys import DYNAMICS
-from dynmap_rl.utils.cli import parse_numbers
+from dynmap_rl.utils.settings import parse_numbers
 
 from .format.frames import choose_camera, iterate_frames
 from .format.reading import choose_splits, find_dataset, read_column, read_info, read_table, spans

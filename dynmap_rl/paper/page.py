@@ -98,8 +98,9 @@ to tip; the causes are defined in [failures.py](../../dynmap_rl/evaluation/failu
 
 One-step predictions of two datasets: held-out demonstrations, and the expert's first ten steps in validation scenes, where
 the cart is away from the goal. Colour error: root mean square on the pixels of cart and block (of 0 to 1). Chroma: share of
-the variation of the objects' chroma that is explained. Goal: share of the marker's difference from the background. Background: root mean square error on all other pixels. Cart: distance of a linear map of the latent.
-Open loop: distance of the decoded positions of cart and block after two seconds without frames.
+the variation of the objects' chroma that is explained. Goal: share of the marker's difference from the background.
+Background: root mean square error on all other pixels. Cart: distance of a linear map of the latent. Open loop: distance of
+the decoded positions of cart and block after two seconds without frames.
 
 {perception}
 

@@ -147,9 +147,7 @@ def change_windows(
     windows: TensorDictBase, settings: Augmentation, generator: torch.Generator
 ) -> TensorDictBase:
     """Apply the augmentations of the settings to windows ``[B, T]``."""
-    if settings.recolor or settings.mirror or settings.max_shift:
-        windows = augment(windows, generator, settings.max_shift, settings.mirror, settings.recolor)
-    return windows
+    return augment(windows, generator, settings.max_shift, settings.mirror, settings.recolor)
 
 
 def _restore(generator: torch.Generator, state: torch.Tensor, update: int) -> None:

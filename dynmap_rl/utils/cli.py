@@ -19,7 +19,7 @@ import typing
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from .settings import flatten
+from .settings import flatten, parse_numbers
 
 HINTS = {
     **dict.fromkeys(
@@ -189,18 +189,6 @@ def refuse(settings, default, names: Sequence[str], other: str, prefix: str = ""
     for name in names:
         if getattr(settings, name) != getattr(default, name):
             raise ValueError(f"--{prefix}{name} has no effect with {other}; leave it out")
-
-
-def parse_numbers(text: str, option: str) -> list[int]:
-    """Parse numbers such as ``0,1,2``.
-
-    Raises:
-        ValueError: an entry is no whole number.
-    """
-    try:
-        return [int(number) for number in text.split(",")]
-    except ValueError as error:
-        raise ValueError(f"{option} must be whole numbers such as 0,1,2, got {text!r}") from error
 
 
 def parse_seeds(text: str) -> list[int]:

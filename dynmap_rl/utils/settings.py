@@ -1,4 +1,4 @@
-"""Checks that dataclasses of settings share, and settings as one flat dict."""
+"""What settings share: checks of their fields, numbers in a text, and nested settings as one flat dict."""
 
 from __future__ import annotations
 
@@ -33,3 +33,15 @@ def flatten(settings: dict, prefix: str = "") -> dict:
     for name, value in settings.items():
         flat |= flatten(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
     return flat
+
+
+def parse_numbers(text: str, option: str) -> list[int]:
+    """Parse numbers such as ``0,1,2``.
+
+    Raises:
+        ValueError: an entry is no whole number.
+    """
+    try:
+        return [int(number) for number in text.split(",")]
+    except ValueError as error:
+        raise ValueError(f"{option} must be whole numbers such as 0,1,2, got {text!r}") from error

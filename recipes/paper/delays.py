@@ -181,10 +181,8 @@ def write(config: Config) -> None:
     results = read_delays(config.results)
     if not results:
         raise ValueError(f"{config.results} must have results; run recipes/paper/delays.py first")
-    page, conditions = (
-        config.results / "README.md",
-        config.figure.with_stem(f"{config.figure.stem}_conditions"),
-    )
+    page = config.results / "README.md"
+    conditions = config.figure.with_stem(f"{config.figure.stem}_conditions")
     plot_delays(results, config.figure)
     plot_conditions(results, conditions)
     write_bytes(page, delay_page(results).encode())

@@ -123,7 +123,7 @@ def record_datasets(runs: list[Run]) -> None:
 
     for task in {run.task for run in runs if not run.dataset}:
         find_or_record(task)
-    for task in {run.task for run in runs if run.dataset}:
+    for task in {run.task for run in runs if run.dataset == UNDISTURBED.format(task=run.task)}:
         record_dataset(UNDISTURBED.format(task=task), task, "undisturbed")
 
 
