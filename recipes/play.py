@@ -7,12 +7,12 @@
     python recipes/play.py --record datasets/mine
 
 Arrows or WASD move the cart, Q and E tilt it, a pressed mouse button calls it; of a MuJoCo task, they move the hand as the
-first camera sees it, Q and E up and down. TAB changes the driver: hand, expert or policy. With a policy, the window also
+first camera sees it, Q and E up and down. TAB changes the driver: person, expert or policy. With a policy, the window also
 shows the world model's prediction, one step ahead or, in imagination (I), without frames. PAGE UP and PAGE DOWN make the
 policy's frames late; cart and block are then also drawn translucent, where the model believes them to be. B takes the next
 body in the traces, R the next scene, SPACE pauses, ESC ends.
 
-With --record, every successful episode that the hand alone drove is kept at once. At the end, the episodes become a
+With --record, every successful episode that the person alone drove is kept at once. At the end, the episodes become a
 LeRobot dataset with a page in runs/play; the next session adds to it.
 """
 
@@ -40,7 +40,7 @@ class Config:
     imagine_from: int | None = None
     # Delay of the policy's frames in control steps, at most 20.
     delay: int = 0
-    # First driver: hand, expert or policy; by default the policy where there is one.
+    # First driver: person, expert or policy; by default the policy where there is one.
     driver: str | None = None
     # Number of the first scene.
     scene: int = 0
@@ -137,7 +137,7 @@ def play(config: Config, task: str, session, window, frames: list, dt: float) ->
             session.over
             and not was_over
             and config.record
-            and session.drove == {"hand"}
+            and session.drove == {"person"}
             and session.succeeded
         ):
             count = keep_episode(config.record, task, session.episode(), session.scene_seed)

@@ -199,7 +199,7 @@ class BaseTask(ABC):
         """
         return None
 
-    def hand_action(self, world: Any, direction: np.ndarray) -> np.ndarray:
+    def person_action(self, world: Any, direction: np.ndarray) -> np.ndarray:
         """Return the action ``[A]`` of a person who presses keys in the play window.
 
         Args:

@@ -1,4 +1,4 @@
-"""One world that a hand, an expert or a policy drives, and the predictions of a world model; without a window."""
+"""One world that a person, an expert or a policy drives, and the predictions of a world model; without a window."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from dynmap_rl.keys import DYNAMICS
 from dynmap_rl.modules.actor import Actor
 from dynmap_rl.modules.delayed_actor import DelayedActor
 
-DRIVERS = "hand", "expert", "policy"
-HAND_ACCELERATION = np.array([1.5, 1.5, 4.0])  # m/s^2, m/s^2, rad/s^2: at the cart's limit a tall block tips
+DRIVERS = "person", "expert", "policy"
+ACCELERATION = np.array([1.5, 1.5, 4.0])  # m/s^2, m/s^2, rad/s^2: at the cart's limit a tall block tips
 MAX_DELAY = 20  # control steps
 NEAR = 4.0  # 1/s, speed for each m of distance
 
 
-class Hand:
+class Person:
     """Input of a person: a direction by keys, or a place by the mouse.
 
     Attributes:
@@ -49,10 +49,10 @@ class Hand:
         if self.target is not None:
             way = np.asarray(self.target) - commanded[:2]
             # The speed from which the cart can still stop; near the target less, against oscillation.
-            brake = np.sqrt(2 * 0.7 * HAND_ACCELERATION[:2] * np.abs(way))
+            brake = np.sqrt(2 * 0.7 * ACCELERATION[:2] * np.abs(way))
             speed = np.minimum(brake, NEAR * np.abs(way)) * CONTROL_DT
             wanted[:2] = np.sign(way) * np.minimum(speed, ACTION_LIMIT[:2])
-        change = HAND_ACCELERATION * CONTROL_DT**2
+        change = ACCELERATION * CONTROL_DT**2
         return last + np.clip(wanted - last, -change, change)
 
 
@@ -69,9 +69,9 @@ class Session:
 
     Attributes:
         delay: see above; :meth:`set_delay` changes it.
-        driver: one of ``hand``, ``expert``, ``policy``.
+        driver: one of ``person``, ``expert``, ``policy``.
         imagining: whether world model and policy continue without frames, on predicted latents.
-        hand: input of the person.
+        person: input of the person.
         td: present observation, ``[1]``.
         prediction: prediction of the present: ``pixels`` uint8 ``[S, cameras * S, 3]`` and ``[D]`` by quantity; empty
             in the first step of an episode, and without a world model.
@@ -95,7 +95,7 @@ class Session:
         self.actor, self.seed, self.split = actor, seed, split
         self.task: BaseTask = self.env.task
         self.expert, self.expert_task = _find_expert(self.task, expert or task, named=expert is not None)
-        self.driver, self.hand = "policy" if actor else "hand", Hand()
+        self.driver, self.person = "policy" if actor else "person", Person()
         self.set_delay(delay)
 
     def set_delay(self, delay: int) -> None:
@@ -108,7 +108,7 @@ class Session:
     def drivers(self) -> tuple[str, ...]:
         """Drivers that are available."""
         expert = self.expert is not None or self.task.is_scripted
-        available = {"hand": True, "expert": expert, "policy": self.actor is not None}
+        available = {"person": True, "expert": expert, "policy": self.actor is not None}
         return tuple(driver for driver in DRIVERS if available[driver])
 
     @property
@@ -148,7 +148,11 @@ class Session:
             return
         self.drove.add(self.driver)
         seen = self._act()
-        actions = {"hand": self._hand_action, "expert": self._expert_action, "policy": lambda: seen["action"]}
+        actions = {
+            "person": self._person_action,
+            "expert": self._expert_action,
+            "policy": lambda: seen["action"],
+        }
         action = torch.as_tensor(np.asarray(actions[self.driver]()), dtype=torch.float32).reshape(1, -1)
         td = self.env.step(self.td.set("action", action))
         if self.actor:
@@ -164,10 +168,10 @@ class Session:
         """Return the steps so far, ``[1, T]``, with the entries of a demonstration."""
         return torch.stack(self.steps, 1)
 
-    def _hand_action(self) -> np.ndarray:
+    def _person_action(self) -> np.ndarray:
         if not isinstance(self.task, Task):
-            return self.task.hand_action(self.world, self.hand.direction)
-        return self.hand.action(self.world.commanded, self.world.action)
+            return self.task.person_action(self.world, self.person.direction)
+        return self.person.action(self.world.commanded, self.world.action)
 
     def _expert_action(self) -> np.ndarray:
         if self.demonstrate:

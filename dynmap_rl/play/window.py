@@ -85,17 +85,17 @@ class PlayWindow:
             elif event.type in (pygame.MOUSEBUTTONDOWN, pygame.MOUSEMOTION):
                 self._point(event)
             elif event.type == pygame.MOUSEBUTTONUP:
-                self.session.hand.target = None
+                self.session.person.target = None
         direction = np.zeros(3)
         for axis, sign in (KEYS[key] for key in self.held):
             direction[axis] += sign
-        self.session.hand.direction = direction.clip(-1, 1)
+        self.session.person.direction = direction.clip(-1, 1)
 
     def _press(self, key: str) -> None:
         session = self.session
         if key in KEYS:
             self.held.add(key)
-            session.driver = "hand"
+            session.driver = "person"
         elif key == "escape":
             self.open = False
         elif key == "space":
@@ -116,7 +116,7 @@ class PlayWindow:
         pressed = event.type == pygame.MOUSEBUTTONDOWN or event.buttons[0]
         x, y = (event.pos[0] - MARGIN) / self.size, 1 - (event.pos[1] - MARGIN - LINE) / self.size
         if self.flat and pressed and 0 <= x <= 1 and 0 <= y <= 1:
-            self.session.driver, self.session.hand.target = "hand", (x, y)
+            self.session.driver, self.session.person.target = "person", (x, y)
 
     def draw(self) -> np.ndarray:
         """Draw the present and return the picture, uint8 ``[height, width, 3]``."""

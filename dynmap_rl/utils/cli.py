@@ -59,7 +59,7 @@ def run_recipe(
         message = describe_error(error)
         if debug or message is None:
             raise
-        print(f"error: {message}", file=sys.stderr)
+        print(f"error: {_name_options(message, config_class)}", file=sys.stderr)
         sys.exit(2)
 
 
@@ -108,15 +108,34 @@ def read_settings(path: Path) -> dict:
     return settings
 
 
-def list_options(config_class: type, prefix: str = "--") -> dict[str, type]:
+def list_options(config_class: type) -> dict[str, type]:
     """Return the type of every option of a dataclass of settings, nested ones by their dotted names."""
-    options = {}
+    return {
+        f"{prefix}{name}": kind
+        for group, prefix in _list_groups(config_class)
+        for name, kind in typing.get_type_hints(group).items()
+        if not dataclasses.is_dataclass(kind)
+    }
+
+
+def _list_groups(config_class: type, prefix: str = "--") -> list[tuple[type, str]]:
+    """Return the dataclass itself and those nested in it, with the prefixes of their options."""
+    groups = [(config_class, prefix)]
     for name, kind in typing.get_type_hints(config_class).items():
         if dataclasses.is_dataclass(kind):
-            options |= list_options(kind, f"{prefix}{name}.")
-        else:
-            options[f"{prefix}{name}"] = kind
-    return options
+            groups += _list_groups(kind, f"{prefix}{name}.")
+    return groups
+
+
+def _name_options(message: str, config_class: type) -> str:
+    """Replace fields of settings in a message, such as ``Evaluation.episodes``, by their options."""
+    groups = _list_groups(config_class)
+
+    def options(field: re.Match) -> str:
+        names = [prefix + field[2] for group, prefix in groups if group.__name__ == field[1]]
+        return " or ".join(names) or field[0]
+
+    return re.sub(r"\b([A-Z]\w*)\.(\w+)", options, message)
 
 
 def read_arguments(given: Sequence[str], config_class: type) -> list[str]:

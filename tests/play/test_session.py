@@ -14,7 +14,7 @@ from dynmap_rl.evaluation.rollout import roll_out
 from dynmap_rl.modules.actor import MEMORY, Actor
 from dynmap_rl.modules.checkpoints import make_policy
 from dynmap_rl.modules.delayed_actor import DelayedActor
-from dynmap_rl.play.session import Hand, Session
+from dynmap_rl.play.session import Person, Session
 
 
 @pytest.fixture(scope="module")
@@ -104,10 +104,10 @@ def test_imagination_from_the_first_step_begins_with_a_frame(actor):
         assert torch.equal(plain.memory[key], imagining.memory[key])
 
 
-def test_the_hand_goes_where_it_points_and_stops_there():
+def test_the_person_goes_where_it_points_and_stops_there():
     session = Session("balance_reaching", seed=1)
-    session.driver = "hand"
-    session.hand.target = (0.6, 0.4)
+    session.driver = "person"
+    session.person.target = (0.6, 0.4)
     for _ in range(110):
         session.step()
     assert np.abs(session.world.position[:2] - (0.6, 0.4)).max() < 0.01
@@ -116,10 +116,10 @@ def test_the_hand_goes_where_it_points_and_stops_there():
 
 
 def test_keys_move_at_the_limit_of_speed():
-    hand, action = Hand(), np.zeros(3)
-    hand.direction = np.array([1.0, 0.0, -1.0])
+    person, action = Person(), np.zeros(3)
+    person.direction = np.array([1.0, 0.0, -1.0])
     for _ in range(40):
-        action = hand.action(np.zeros(3), action)
+        action = person.action(np.zeros(3), action)
     np.testing.assert_allclose(action, [0.04, 0, -0.1])
 
 

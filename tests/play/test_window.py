@@ -31,17 +31,17 @@ def test_keys_and_mouse(window):
     assert played.driver == "expert"
     pygame.event.post(pygame.event.Event(pygame.KEYDOWN, key=pygame.K_LEFT))
     window.handle()
-    assert played.driver == "hand" and played.hand.direction.tolist() == [-1, 0, 0]
+    assert played.driver == "person" and played.person.direction.tolist() == [-1, 0, 0]
     pygame.event.post(pygame.event.Event(pygame.KEYUP, key=pygame.K_LEFT))
     window.handle()
-    assert played.hand.direction.tolist() == [0, 0, 0]
+    assert played.person.direction.tolist() == [0, 0, 0]
     middle = {"pos": (8 + 64, 8 + 20 + 64), "button": 1}
     pygame.event.post(pygame.event.Event(pygame.MOUSEBUTTONDOWN, middle))
     window.handle()
-    assert played.hand.target == (0.5, 0.5)
+    assert played.person.target == (0.5, 0.5)
     pygame.event.post(pygame.event.Event(pygame.MOUSEBUTTONUP, middle))
     press(window, "space", "b")
-    assert played.hand.target is None and window.paused and window.body == "cart"
+    assert played.person.target is None and window.paused and window.body == "cart"
     first = played.scene_seed
     press(window, "r", "i", "f5")
     assert played.scene_seed != first and not played.imagining

@@ -94,8 +94,8 @@ def test_the_expert_is_judged(recorded):
 
 def test_a_person_and_the_expert_drive(own_task):  # noqa: F811
     session = Session(own_task)
-    assert session.drivers == ("hand", "expert")
-    session.hand.direction[:] = 1, 0, 0  # to the right, as the camera looks along y
+    assert session.drivers == ("person", "expert")
+    session.person.direction[:] = 1, 0, 0  # to the right, as the camera looks along y
     session.step()
     assert session.td["dynamics", "velocity"][0, 6] > 0 and session.steps[0]["action"].tolist() == [[1.0]]
     session.restart()
@@ -109,8 +109,8 @@ def test_a_person_and_the_expert_drive(own_task):  # noqa: F811
 def test_a_policy_is_watched_and_a_person_recorded(recorded, tmp_path, monkeypatch):
     """The expert acts in the place of the person."""
     _, task = recorded
-    monkeypatch.setattr(Session, "_hand_action", Session._expert_action)
-    arguments = "--task", task, "--driver", "hand", "--record", "mine", "--steps", "101", "--size", "64"
+    monkeypatch.setattr(Session, "_person_action", Session._expert_action)
+    arguments = "--task", task, "--driver", "person", "--record", "mine", "--steps", "101", "--size", "64"
     played = run(tmp_path, "play", *arguments, "--gif", "film.gif")
     assert played.returncode == 0, played.stderr
     assert load_dataset(tmp_path / "mine").shape == (2, 40)

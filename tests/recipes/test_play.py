@@ -72,10 +72,10 @@ def test_still_parts_keep_their_colours_in_an_animation(tmp_path):
 
 def test_episodes_of_a_person_become_a_dataset(tmp_path, monkeypatch):
     """The expert acts in the place of the person."""
-    monkeypatch.setattr(Session, "_hand_action", Session._expert_action)
+    monkeypatch.setattr(Session, "_person_action", Session._expert_action)
     pushed = []
     monkeypatch.setattr("dynmap_rl.data.format.hub.push_dataset", lambda *arguments: pushed.append(arguments))
-    arguments = "--driver", "hand", "--record", "mine", "--steps", 141 + 120, "--size", 64
+    arguments = "--driver", "person", "--record", "mine", "--steps", 141 + 120, "--size", 64
     result = run(tmp_path, "play", *arguments, "--push_to_hub", "someone/mine")
     assert result.returncode == 0, result.stderr
     assert pushed == [(Path("mine"), "someone/mine")] and "pushed: someone/mine" in result.stdout
@@ -98,7 +98,7 @@ def test_later_episodes_are_added_to_a_dataset_of_ones_own_task(tmp_path, monkey
         "        return world.steps >= 120\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
-    arguments = "--driver", "hand", "--task", TASK, "--record", "mine", "--steps", 141 + 120, "--size", 64
+    arguments = "--driver", "person", "--task", TASK, "--record", "mine", "--steps", 141 + 120, "--size", 64
     result = run(tmp_path, "play", *arguments)
     assert result.returncode == 0, result.stderr
     assert load_meta(tmp_path / "mine")["task"] == TASK

@@ -115,7 +115,7 @@ def test_an_unknown_option_is_refused_with_a_suggestion(run, capsys, option, adv
     [
         (["--steps", "many"], "steps"),
         (["--first.updates", "many"], "first.updates"),
-        (["--first.updates", "0"], "Group.updates must be at least 1, got 0"),
+        (["--first.updates", "0"], "--first.updates or --second.updates must be at least 1, got 0"),
         (["--steps"], "--steps"),
         (["stray"], "stray"),
     ],

@@ -223,7 +223,7 @@ class MujocoTask(BaseTask):
     def reward(self, world: MujocoWorld) -> float:
         return world.reward
 
-    def hand_action(self, world: MujocoWorld, direction: np.ndarray) -> np.ndarray:
+    def person_action(self, world: MujocoWorld, direction: np.ndarray) -> np.ndarray:
         """Return the action that moves along ``direction`` ``[3]`` as the first camera sees it: right, away and up."""
         azimuth = np.deg2rad(self.cameras[0].azimuth)
         away, right = (np.cos(azimuth), np.sin(azimuth)), (np.sin(azimuth), -np.cos(azimuth))
