@@ -10,8 +10,9 @@
 The table has a world model for each source of dynamics and seed, with recurrent and feed-forward policies (see
 dynmap_rl/paper/sources.py). Its datasets are derived from the recordings of the tasks where they are missing. A cell is a
 run of recipes/decoupled.py or end_to_end.py; a result is a JSON file, cells with a result are skipped, and the same
-command resumes a stopped grid. Runs of recipes/paper/tables.py with the same training are not repeated. Every world model is then measured by linear maps. The folder of the results gets
-README.md with the tables and the rank correlation of the measures with success, and the figures.
+command resumes a stopped grid. Runs of recipes/paper/tables.py with the same training are not repeated. Every world
+model is then measured by linear maps. The folder of the results gets README.md with the tables and the rank correlation
+of the measures with success, and the figures.
 """
 
 import sys

@@ -80,30 +80,28 @@ ROWS = {
 
 def speed_table(results: dict) -> str:
     """Return the rows that have been timed as a table."""
-    lines = [
-        "| what | against | ours | theirs | ratio | first release | goal |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    lines = ["| what | against | ours | theirs | ratio | goal |", "|---|---|---|---|---|---|"]
     for name, (what, against, unit, factor, goal, _) in ROWS.items():
         if row := results["rows"].get(name):
-            ours, theirs = (f"{row[key] * factor:.3g} {unit}" for key in ("ours", "theirs"))
-            former = results.get("first_release", {}).get(name)  # ratios
-            former = "" if former is None else f"{former:.2f}"
-            lines.append(
-                f"| {what} | {against} | {ours} | {theirs} | **{row['ratio']:.2f}** | {former} | {goal} |"
-            )
+            ours, theirs = (f"{three_digits(row[key] * factor)} {unit}" for key in ("ours", "theirs"))
+            lines.append(f"| {what} | {against} | {ours} | {theirs} | **{row['ratio']:.2f}** | {goal} |")
     return "\n".join(lines)
+
+
+def three_digits(value: float) -> str:
+    return f"{value:.3g}" if value < 1000 else f"{float(f'{value:.3g}'):,.0f}"
 
 
 def main_job_table(main_jobs: dict) -> str:
     """Return the times of the main job, which was timed once on each machine."""
-    lines = ["| `recipes/decoupled.py` from a fresh clone | minutes | SR | PE |", "|---|---|---|---|"]
+    lines = [
+        "| `recipes/decoupled.py` from a fresh clone | commit | minutes | SR | PE |",
+        "|---|---|---|---|---|",
+    ]
     for run in main_jobs["runs"]:
-        found = " | "
-        if "SR" in run:
-            low, high = run["SR_interval"]
-            found = f"{run['SR']:.1f} % [{low:.1f}, {high:.1f}] | {run['PE']:.1f} mm"
-        lines.append(f"| {run['processor']} | {run['real_seconds'] / 60:.1f} | {found} |")
+        low, high = run["SR_interval"]
+        found = f"{run['SR']:.1f} % [{low:.1f}, {high:.1f}] | {run['PE']:.1f} mm"
+        lines.append(f"| {run['processor']} | `{run['commit']}` | {run['real_seconds'] / 60:.1f} | {found} |")
     return "\n".join(lines)
 
 
