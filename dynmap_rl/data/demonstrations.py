@@ -152,8 +152,9 @@ def load_meta(dataset: str | Path) -> dict:
     Returns:
         ``format``, ``task``, ``layout`` (except of cart and block), ``expert``, ``kind``, ``splits`` (name to first
         episode and the one after the last), ``normalization`` (see :func:`dynmap_rl.data.normalization_constants`),
-        ``rejected`` (number of failed candidates), and ``episodes``, a dict for each: ``episode_index``, ``split``, ``scene_seed``, ``checkpoint``, ``noise``, ``detours``, ``pushes``, ``scene``,
-        ``success``, ``dropped``, ``position_error`` (m).
+        ``rejected`` (number of failed candidates), and ``episodes``, a dict for each: ``episode_index``, ``split``,
+        ``scene_seed``, ``checkpoint``, ``noise``, ``detours``, ``pushes``, ``scene``, ``success``, ``dropped``,
+        ``position_error`` (m).
 
     Raises:
         ValueError: the dataset is missing, or is not a recording of this release.

@@ -10,7 +10,8 @@ old; ``onnx`` is ``actor`` in onnxruntime. ``--lerobot`` names policies of LeRob
 which they predict a chunk. ``server`` is a policy in a process of its own, which works on every frame for
 about ``--work`` seconds of its processor (it encodes the frame again and again), and answers with a chunk; the loop goes
 on meanwhile, and its latency is the time to look up the action. It cannot be ``--fast``, as a frame would then be older
-in steps. Loop and server share one core. Rows of the paced loop have names that end in ``_paced``. Writes ``recipes/results/measurements/realtime.json``.
+in steps. Loop and server share one core. Rows of the paced loop have names that end in ``_paced``. Writes
+``recipes/results/measurements/realtime.json``.
 """
 
 from __future__ import annotations

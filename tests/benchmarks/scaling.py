@@ -2,7 +2,8 @@
 
     uv run python tests/benchmarks/scaling.py
 
-Writes ``recipes/results/measurements/scaling.json`` and ``recipes/results/media/scaling.png``, where a straight line of slope one is linear cost.
+Writes ``recipes/results/measurements/scaling.json`` and ``recipes/results/media/scaling.png``, where a straight line of
+slope one is linear cost.
 """
 
 from __future__ import annotations

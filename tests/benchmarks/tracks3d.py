@@ -3,10 +3,10 @@
     uv run --extra mujoco python tests/benchmarks/tracks3d.py
     uv run --extra mujoco python tests/benchmarks/tracks3d.py --recording datasets/few --output found.json
 
-The frames measure pixels, and the table is seen at an angle: x and y of a body are fitted by a polynomial of second order of
-the pixels, over all training steps; what remains is the distance. Derives ``datasets/fetch_push_tracks`` and
-``datasets/fetch_push_color`` beside the recording where they are missing, from ``datasets/fetch_push`` (``python recipes/collect.py --task
-mujoco:FetchPush``). Writes ``recipes/results/measurements/tracks3d.json``.
+The frames measure pixels, and the table is seen at an angle: x and y of a body are fitted by a polynomial of second
+order of the pixels, over all training steps; what remains is the distance. Derives ``datasets/fetch_push_tracks`` and
+``datasets/fetch_push_color`` beside the recording where they are missing, from ``datasets/fetch_push``
+(``python recipes/collect.py --task mujoco:FetchPush``). Writes ``recipes/results/measurements/tracks3d.json``.
 """
 
 from __future__ import annotations
