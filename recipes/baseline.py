@@ -3,6 +3,8 @@
     python recipes/baseline.py --task mujoco:PlateSlide                        # ACT
     python recipes/baseline.py --task mujoco:PlateSlide --policy diffusion
 
+    python recipes/baseline.py --full_size --steps 100000 --batch 8            # LeRobot's defaults, for a GPU
+
 Needs pip install '.[lerobot]'. The policies read frames and observation.state, which holds the goal. They are smaller than
 LeRobot's defaults, for two cores, and all weights begin at random. The same command resumes a stopped run at LeRobot's
 last checkpoint, and prints the result of a finished one.
@@ -19,7 +21,7 @@ from dynmap_rl.utils.settings import check_at_least, check_choice
 
 TRAINED = "checkpoints/last/pretrained_model"
 ROWS = {"act": "ACT", "diffusion": "Diffusion Policy"}
-OPTIONS = {
+OPTIONS = {  # for two cores
     "act": (
         "--policy.dim_model=256", "--policy.dim_feedforward=1024", "--policy.chunk_size=20",
         "--policy.n_action_steps=10", "--policy.optimizer_lr=1e-4", "--policy.optimizer_lr_backbone=1e-4",
@@ -51,6 +53,8 @@ class Config:
     steps: int = 4000
     # Samples in a batch.
     batch: int = 32
+    # Sizes and learning rates of LeRobot's defaults.
+    full_size: bool = False
     # Evaluation in closed loop, here without the paper's protocol.
     eval: Evaluation = Evaluation(paper_episodes=0)
     # Device and cores.
@@ -114,7 +118,7 @@ def train(config: Config, dataset: str | Path, folder: Path, seed: int, device: 
         shutil.rmtree(output, ignore_errors=True)  # of a run without a checkpoint
         arguments = [
             f"--policy.type={config.policy}", f"--policy.device={device}", "--policy.push_to_hub=false",
-            "--policy.pretrained_backbone_weights=null", *OPTIONS[config.policy],
+            "--policy.pretrained_backbone_weights=null", *([] if config.full_size else OPTIONS[config.policy]),
             "--dataset.repo_id=local/demonstrations", f"--dataset.root={root}",
             f"--dataset.episodes={list(read_split(root, read_info(root), 'train'))}",
             "--dataset.use_imagenet_stats=false", f"--batch_size={config.batch}", "--num_workers=0",

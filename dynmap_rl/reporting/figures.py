@@ -115,7 +115,11 @@ def plot_perception(
     figure, axes = plt.subplots(
         *shape, figsize=(1.1 * shape[1] + 1.5, 1.1 * shape[0]), squeeze=False, layout="constrained"
     )
-    shown = [(name, frames[:, t]) for t in steps for name, frames in rows.items()]
+    shown = [
+        (f"frame, {t * CONTROL_DT:.2f} s" if name == "frame" else name, frames[:, t])
+        for t in steps
+        for name, frames in rows.items()
+    ]
     for row, (name, frames) in zip(axes, shown, strict=True):
         for axis, frame in zip(row, frames, strict=True):
             axis.imshow(frame.clamp(0, 1).permute(1, 2, 0).numpy())
