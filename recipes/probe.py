@@ -105,23 +105,24 @@ def main(config: Config) -> None:
 
 
 def load_world_models(runs: list[str]) -> dict:
-    """Load the world models of runs by the names of their rows."""
+    """Load the world models of runs, by the names of their rows and, where those are equal, of the runs."""
+    from collections import Counter
+
     from dynmap_rl.envs.world import ACTION_LIMIT
     from dynmap_rl.modules.supervision import row_name
     from dynmap_rl.runs.lookup import load_source
 
     models = {}
-    for run in runs:
-        world_model, source = load_source(run.strip())
+    for run in dict.fromkeys(run.strip().rstrip("/") for run in runs):
+        world_model, source = load_source(run)
         if "task" not in source or world_model.transition.action.size != len(ACTION_LIMIT):
             raise ValueError(f"--runs must be of tasks 1 to 3, got {run}")
-        name = f"{row_name(world_model.supervision, source['training'])}, {source['training']}"
+        row = f"{row_name(world_model.supervision, source['training'])}, {source['training']}"
         if world_model.architecture != "glimpse":
-            name += f", {world_model.architecture}"
-        if name in models:
-            raise ValueError(f"--runs must be of different rows, got {name} twice")
-        models[name] = world_model
-    return models
+            row += f", {world_model.architecture}"
+        models[row, run] = world_model
+    count = Counter(row for row, _ in models)
+    return {row if count[row] == 1 else f"{row}, {run}": model for (row, run), model in models.items()}
 
 
 def describe(open_loop: dict, probes: dict, perception: dict, verdicts: dict, seconds: float) -> str:

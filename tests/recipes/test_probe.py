@@ -1,11 +1,14 @@
 """The probe recipe on untrained world models."""
 
+import shutil
+
 import pytest
 from commands import run
 
 from dynmap_rl.data.demonstrations import load_meta
 from dynmap_rl.modules.checkpoints import make_world_model, save_world_model
 from dynmap_rl.utils.files import read_json, write_json
+from recipes.probe import load_world_models
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +60,6 @@ def test_writes_errors_and_probes_of_every_world_model(trained, recording, tmp_p
     [
         (["--runs", "nothing"], "nothing"),
         (["--runs", "robot"], "must be of tasks 1 to 3, got robot"),
-        (["--runs", "none,none"], "Only-RGB, decoupled twice"),
         (["--runs", "none", "--test_episodes", "0"], "test_episodes"),
         (["--runs", "position", "--horizon", "200"], "120, got 20 + 200"),
     ],
@@ -68,6 +70,16 @@ def test_bad_input_is_refused_before_anything_is_written(trained, recording, arg
     assert result.returncode == 2
     assert message in result.stderr and result.stderr.count("\n") == 1
     assert sorted(trained.rglob("*")) == before
+
+
+def test_runs_of_one_row_are_named_by_their_folders(trained):
+    source = read_json(trained / "none/eval.json")
+    write_json(trained / "again/eval.json", source)
+    shutil.copytree(trained / "none/world_model", trained / "again/world_model")
+    none, again, position = (f"{trained / name}" for name in ("none", "again", "position"))
+    models = load_world_models([none, again, f" {position}", f"{none}/"])
+    row = "Only-RGB, decoupled"
+    assert list(models) == [f"{row}, {none}", f"{row}, {again}", "RGB+[P], decoupled"]
 
 
 def test_a_dataset_of_another_task_is_refused(trained, recordings, tmp_path):
