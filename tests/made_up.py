@@ -42,9 +42,9 @@ def write(
     else:
         results = [[{"test": {"rows": one}, "paper": {"rows": one}}] * 3 for one in made]
     folder.mkdir(parents=True, exist_ok=True)
-    for run, seeds in zip(runs, results, strict=False):
+    for number, (run, seeds) in enumerate(zip(runs, results, strict=False)):
         facts = {"task": task, "policy": policy, "row": row, "command": "python x.py", "commit": commit}
-        facts |= {"world_model_sha256": None if len(runs) == 1 else "0", "results": seeds}
+        facts |= {"world_model_sha256": None if len(runs) == 1 else f"{row} {number}", "results": seeds}
         (folder / f"{run.name}.json").write_text(json.dumps(facts))
 
 

@@ -137,6 +137,24 @@ def welch_interval(rates_a: Sequence[float], rates_b: Sequence[float]) -> tuple[
     return float(found.low), float(found.high)
 
 
+def paired_interval(rates_a: Sequence[float], rates_b: Sequence[float]) -> tuple[float, float] | None:
+    """Return the 95 % interval (paired t) of the mean difference of rates, such as those of one world model each.
+
+    Args:
+        rates_a: a rate for each, in %.
+        rates_b: likewise, in the same order; subtracted.
+
+    Returns:
+        The ends, in points; None for fewer than two pairs, or equal differences.
+    """
+    from scipy.stats import ttest_rel
+
+    if len(rates_a) < 2 or np.ptp(np.subtract(rates_a, rates_b)) < 1e-9:
+        return None
+    found = ttest_rel(rates_a, rates_b).confidence_interval()
+    return float(found.low), float(found.high)
+
+
 def rate_gap(rows_a: list[list[dict]], rows_b: list[list[dict]], outcome: str = "success") -> dict:
     """Compare the rates of two results on the same start states.
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from dynmap_rl.evaluation.statistics import rate_gap, welch_interval
+from dynmap_rl.evaluation.statistics import paired_interval, rate_gap, welch_interval
 
 from .cells import TASKS, Key
 from .results import ROWS, Cell
@@ -49,7 +49,7 @@ class Pair:
 
 def list_pairs() -> list[Pair]:
     """Return the comparisons of all claims."""
-    return [*_supervision(), *_policies(), *_trainings(), *_transfer()]
+    return [*_supervision(), *_policies(), *_plain(), *_trainings(), *_transfer()]
 
 
 def _position(row: str) -> str:
@@ -81,6 +81,20 @@ def _policies() -> Iterator[Pair]:
         for row in ["Only-RGB", *DYNAMICS_ROWS]:
             pair = (ONE, "decoupled", "recurrent", row), (ONE, "decoupled", "feedforward", row)
             yield Pair(claim, _position(row), row, *pair)
+
+
+def _plain() -> Iterator[Pair]:
+    """Yield the pairs of world models with a plain CNN, whose success is further from 100 %."""
+    rows = "RGB+[P+V], plain CNN", "Only-RGB, plain CNN"
+    for policy in ("recurrent", "feedforward"):
+        pair = ((ONE, "decoupled", policy, row) for row in rows)
+        yield Pair(
+            "With a plain CNN, dynamics beat Only-RGB", policy, f"{policy}: RGB+[P+V] - Only-RGB", *pair
+        )
+    for row in rows:
+        pair = ((ONE, "decoupled", policy, row) for policy in ("recurrent", "feedforward"))
+        name = row.split(",")[0]
+        yield Pair("With a plain CNN, recurrent policies beat feed-forward ones", name, name, *pair)
 
 
 def _trainings() -> Iterator[Pair]:
@@ -116,20 +130,34 @@ def compare_cells(cells: Mapping[Key, Cell]) -> list[dict]:
     Returns:
         Dicts with ``claim``, ``group`` and ``comparison`` of the pair; ``rates`` of both (%); ``gap`` in points with its
         95 % bootstrap ``interval`` over the shared start states; ``p`` of a paired permutation test over them; the 95 %
-        interval of the gap over ``trainings`` (Welch's, or None, see :func:`welch_interval`); numbers of
-        ``scenes`` and, for both, of ``world_models``; and ``verdict``. That is ``holds`` if p is below 0.05 and the
-        interval over trainings is on the side that the claim says; ``does not hold`` if it is on the other side; else
-        ``open``.
+        interval of the gap over ``trainings`` (see :func:`gap_over_trainings`); numbers of ``scenes`` and, for both, of
+        ``world_models``; and ``verdict``. That is ``holds`` if p is below 0.05 and the interval over trainings is on the
+        side that the claim says; ``does not hold`` if it is on the other side; else ``open``.
     """
-    pairs = [pair for pair in list_pairs() if cells[pair.a].results and cells[pair.b].results]
+    pairs = [
+        pair for pair in list_pairs() if all(key in cells and cells[key].results for key in (pair.a, pair.b))
+    ]
     return [_compare(pair, cells[pair.a], cells[pair.b]) for pair in pairs]
+
+
+def gap_over_trainings(a: Cell, b: Cell, outcome: str = "success") -> tuple[float, float] | None:
+    """Return the 95 % interval of the gap over world models (points), or None where their number says nothing.
+
+    It is paired where both cells have policies on the same frozen world models, as recurrent and feed-forward policies
+    of a row; otherwise Welch's.
+    """
+    rates_a, rates_b = a.rates(outcome), b.rates(outcome)
+    if shared := [name for name in a.fingerprints if name in b.fingerprints]:
+        paired_a = [rates_a[a.fingerprints.index(name)] for name in shared]
+        paired_b = [rates_b[b.fingerprints.index(name)] for name in shared]
+        return paired_interval(paired_a, paired_b)
+    return welch_interval(rates_a, rates_b)
 
 
 def _compare(pair: Pair, a: Cell, b: Cell) -> dict:
     metric, outcome = pair.metric
-    each_a, each_b = a.rates(outcome), b.rates(outcome)
     found = rate_gap(a.policies, b.policies, outcome)
-    trainings = welch_interval(each_a, each_b)
+    trainings = gap_over_trainings(a, b, outcome)
     low, high = trainings if trainings and found["p"] < LEVEL else (0, 0)
     above, below = low > 0, high < 0
     if pair.claim == DROPS:  # a negative gap supports it
@@ -144,7 +172,7 @@ def _compare(pair: Pair, a: Cell, b: Cell) -> dict:
         "p": found["p"],
         "trainings": trainings,
         "scenes": len(a.policies[0]),
-        "world_models": [len(each_a), len(each_b)],
+        "world_models": [len(a.world_models), len(b.world_models)],
         "verdict": HOLDS if above else FAILED if below else OPEN,
     }
 
@@ -156,7 +184,7 @@ def judge_claim(comparisons: list[dict]) -> str:
 
 
 def markdown_claims(comparisons: list[dict]) -> str:
-    """Return a table of the verdicts on every claim.
+    """Return a table of the verdicts on every claim, those without runs at the end.
 
     Args:
         comparisons: result of :func:`compare_cells`.
@@ -168,6 +196,10 @@ def markdown_claims(comparisons: list[dict]) -> str:
         gaps = sorted(row["gap"] for row in own)
         span = f"{gaps[0]:+.1f}" if len(gaps) == 1 else f"{gaps[0]:+.1f} to {gaps[-1]:+.1f}"
         lines.append([claim, group, f"**{judge_claim(own)}**", *counts, span])
+    compared = {tuple(line[:2]) for line in lines}
+    for claim, group in dict.fromkeys((pair.claim, pair.group) for pair in list_pairs()):
+        if (claim, group) not in compared:
+            lines.append([claim, group, "no runs", *["0"] * len(VERDICTS), ""])
     return join_table(["claim", "comparisons", "verdict", *VERDICTS, "gaps, points"], lines)
 
 

@@ -52,15 +52,19 @@ paper.
 Every claim is a set of comparisons of two cells, paired over the 1,000 scenes that both share. A gap is the difference of the
 two rates in percentage points, with a 95 % bootstrap interval over the scenes, and p, the exact probability of a gap of this
 size if the two cells were exchanged at random in every scene. Both say nothing about further trainings. The 95 % interval
-over world models (Welch's) does; with three on either side it is wide.
+over world models does: paired where both cells are of the same frozen world models, otherwise Welch's. With three on either
+side it is wide.
 
 A comparison holds if p is below 0.05 and the interval over world models lies on the side that the claim says. It does not
 hold if that interval lies on the other side. Otherwise it is open, also with a single world model on one side or without any
-variation between them. A claim has a verdict if all of its comparisons agree. Comparisons with one and the same cell, such as
-Only-RGB, are no independent evidence. On task 3 the paper finds limited improvement by dynamics.
+variation between them. A claim has a verdict if all of its comparisons agree. Single comparisons are not corrected for their
+number, and those with one and the same cell, such as Only-RGB, are no independent evidence. On task 3 the paper finds limited
+improvement by dynamics.
 
-All comparisons are of the default encoder, with which Only-RGB nearly solves task 1. With the paper's plain CNN, dynamics are
-worth about 50 points there ([table](#tables-of-our-own)).
+Comparisons are of the default encoder unless the claim names a plain CNN. With the default encoder even Only-RGB nearly solves
+task 1, which leaves no room for gaps. The plain CNN is nearer to the paper, which has "a simple CNN-based encoder" and gives
+neither layers nor sizes; ours is trained with everything else that the default is trained with
+([deviations](../README.md#choices-and-deviations-from-the-paper)).
 
 {claims}
 

@@ -64,6 +64,11 @@ class Cell:
         """Episode rows on the shared start states, by policy."""
         return [rows for policies in self.world_models for rows in policies]
 
+    @property
+    def fingerprints(self) -> list[str]:
+        """Fingerprints of the frozen world models; none where world models are trained with their policies."""
+        return [found for result in self.results if (found := result.get("world_model_sha256"))]
+
     def rates(self, outcome: str = "success") -> list[float]:
         """Return the rate of an outcome for each world model, over its policies (%)."""
         return [

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
-from scipy.stats import permutation_test, t, ttest_1samp
+from scipy.stats import permutation_test, t, ttest_1samp, ttest_rel
 
 from dynmap_rl.evaluation.statistics import (
     exchange_p,
+    paired_interval,
     rate_gap,
     shared_interval,
     student_interval,
@@ -57,6 +58,9 @@ def test_welchs_interval_is_the_textbook_one():
     assert welch_interval(a, b) == pytest.approx((94 - 75 - half, 94 - 75 + half))
     low, high = welch_interval([100.0] * 3, [99.7, 100.0, 100.0])
     assert low < 0 < high, "one world model alone is worse"
+    found = ttest_rel(a, [88.0, 90.0, 96.0]).confidence_interval()
+    assert paired_interval(a, [88.0, 90.0, 96.0]) == pytest.approx((found.low, found.high))
+    assert paired_interval([90.0], [80.0]) is None and paired_interval([90.0, 80.0], [80.0, 70.0]) is None
     assert welch_interval(a, [80.0]) is None and welch_interval([90.0] * 2, [80.0] * 2) is None
 
 
