@@ -158,7 +158,7 @@ def load_policy(config: Config, folder: Path, instruction: str):
 
 
 def judge_expert(config: Config) -> tuple[Path, str, dict]:
-    """Return the folder with an animation, the numbers as text, and the result: ``rates`` and ``intervals`` (%)."""
+    """Return the folder with an animation, the numbers as text, and the result: ``rates``, ``intervals`` (%), ``rows``."""
     from dynmap_rl.envs.scene import scene_seeds
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.evaluation.experts import judge_demonstrator, list_outcomes
@@ -191,8 +191,9 @@ def judge_expert(config: Config) -> tuple[Path, str, dict]:
     ]
     folder = name_folder(config, task.name, *Path(expert).parts[-4:], checkpoint)
     draw(failures_first(seeds, outcomes["success"], alone=config.failures), folder / "rollouts.gif")
+    rows = {name: "".join("01"[bool(value)] for value in values) for name, values in outcomes.items()}
     result = {"task": config.task or task.name, "expert": expert, "checkpoint": checkpoint}
-    return folder, "\n".join(lines), result | {"rates": rates, "intervals": intervals}
+    return folder, "\n".join(lines), result | {"rates": rates, "intervals": intervals, "rows": rows}
 
 
 if __name__ == "__main__":

@@ -44,7 +44,7 @@ def probe(world_model: WorldModel, train: TensorDictBase, test: TensorDictBase) 
 def judge_states(probed: dict[str, dict]) -> dict:
     """Judge a world model by the velocities that a linear map reads from its best state, without a policy.
 
-    On task 1, with the paper's plain CNN, R^2 ranks sources of dynamics much like the success of recurrent policies
+    On task 1, with the plain CNN, R^2 ranks sources of dynamics much like the success of recurrent policies
     (``recipes/results/sources_plain``). Other tasks have not been measured.
 
     Args:

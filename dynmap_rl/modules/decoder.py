@@ -15,7 +15,7 @@ from .normalization import Normalizer
 
 
 class PlainDecoder(nn.Module):
-    """Plain CNN from predicted latents and hidden states to frames (the paper's form).
+    """Plain CNN from predicted latents and hidden states to frames, the counterpart of :class:`PlainEncoder`.
 
     Args:
         input_size: Z + 2 H.

@@ -40,7 +40,7 @@ class Encoder(nn.Module):
 
 
 class PlainEncoder(Encoder):
-    """Plain CNN (the paper's form).
+    """Plain CNN. The paper has "a simple CNN-based encoder", and gives neither layers nor sizes.
 
     Three convolutions on blocks of 4 x 4 pixels end in maps of stride 8. The frame's mean colour, which the normalisation
     removes, reaches the latent through a linear map of its own.

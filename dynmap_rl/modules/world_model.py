@@ -34,7 +34,7 @@ class WorldModel(nn.Module):
         dynamics: normaliser of each supervised quantity: any of position, velocity, acceleration, or none.
         latent_size: Z.
         hidden_size: H.
-        architecture: ``plain``, the paper's plain CNNs (:class:`PlainEncoder`, :class:`PlainDecoder`), ``glimpse``
+        architecture: ``plain``, plain CNNs (:class:`PlainEncoder`, :class:`PlainDecoder`), ``glimpse``
             (:class:`GlimpseEncoder`, :class:`SpriteDecoder`), or, with the decoder of ``glimpse``, ``resnet18``,
             ``resnet18_imagenet`` (:class:`ResNetEncoder`, which has random weights here in both cases) or ``vit``
             (:class:`ViTEncoder`).

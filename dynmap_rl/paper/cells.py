@@ -161,7 +161,7 @@ def _transfer(sources: Iterable[Run], seed: int = 0) -> list[Run]:
 
 
 def _plain(supervision: str, seed: int) -> list[Run]:
-    """Return the runs with the paper's plain CNNs."""
+    """Return the runs with plain CNNs."""
     run = _train(supervision, seed)
     *column, row = run.cell
     run = replace(

@@ -32,7 +32,7 @@ the column says how those were trained.
   episode
 - [`delays/`](delays/README.md): success against the delay of the frames
 - [`benchmarks3d/`](benchmarks3d/README.md): the MuJoCo tasks
-- [`sources_plain/`](sources_plain/README.md): success against the source of the dynamics, with the paper's plain CNN; its
+- [`sources_plain/`](sources_plain/README.md): success against the source of the dynamics, with a plain CNN; its
   first world models were trained apart from those of the tables
 - [`measurements/`](measurements): other measurements
 - [`media/`](media): figures and animations
@@ -92,7 +92,7 @@ deviation on either side. Equal rates have none, since they do not say how much 
 
 ## What fails
 
-Failed episodes of the first policy of each world model that a row counts, run again
+Failed episodes of the first policy of as many world models as the row says, run again
 (`python recipes/paper/figures.py --only failures`). A drop is named after the place and the cart's speed when the block began
 to tip; the causes are defined in [failures.py](../../dynmap_rl/evaluation/failures.py).
 
@@ -180,7 +180,9 @@ def markdown_runs(results: Path) -> str:
         run = read_json(path)
         rates, count = run["rates"], f"{run['episodes']:,}"
         dropped = f"{rates['dropped']:.1f}" if "DR" in METRICS[run["task"]] else ""
-        lines.append([run["task"], "careless", "", count, dropped, "", f"{rates['success']:.1f}"])
+        low, high = run["intervals"]["success"]
+        success = f"**{rates['success']:.1f}** [{low:.1f}, {high:.1f}]"
+        lines.append([run["task"], "careless", "", count, dropped, "", success])
     for path in sorted((results / "measurements").glob("*.json")):
         run = read_json(path)
         if run.get("policy") == "LeRobot":

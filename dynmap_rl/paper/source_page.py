@@ -17,7 +17,7 @@ from .source_results import (
 )
 from .tables import join_table
 
-FORMS = {"glimpse": "the default encoder and decoder", "plain": "the paper's plain CNN"}
+FORMS = {"glimpse": "the default encoder and decoder", "plain": "a plain CNN"}
 
 
 def write_source_page(results: Path, tasks: list[str], architecture: str = "glimpse") -> list[Path]:

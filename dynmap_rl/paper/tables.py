@@ -13,7 +13,7 @@ from .published import METRICS, TABLES
 from .results import COLUMNS, ROWS, Cell, count_commits
 
 OWN = {  # tables that the paper does not have: what they show
-    "extra": "World models of the paper's plain CNNs beside the default, on the shared test scenes",
+    "extra": "World models with plain CNNs beside the default, on the shared test scenes",
     "ablations": "RGB+[P+V] with recurrent policies, on validation scenes: the default, and rows that differ from it",
 }
 

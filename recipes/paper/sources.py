@@ -4,7 +4,7 @@
     python recipes/paper/sources.py --only tracks,none,simulator
     python recipes/paper/sources.py --part table --world_models 0
     python recipes/paper/sources.py --part data
-    python recipes/paper/sources.py --part table --architecture plain   # the paper's CNN, for which dynamics decide
+    python recipes/paper/sources.py --part table --architecture plain   # a plain CNN, for which dynamics decide
     python recipes/paper/sources.py --write       # table and figures from the results alone
 
 The table has a world model for each source of dynamics and seed, with recurrent and feed-forward policies (see
@@ -39,7 +39,7 @@ class Config:
     only: str = ""
     # Seeds of the world models, with commas between.
     world_models: str = "0,1,2"
-    # Form of the world models: glimpse, or plain, the paper's CNN.
+    # Form of the world models: glimpse, or plain.
     architecture: str = "glimpse"
     # Folder of the cells' results; by default recipes/results/sources, or sources_plain.
     results: Path | None = None

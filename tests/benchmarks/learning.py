@@ -25,7 +25,7 @@ SUPERVISION = ("position", "velocity")
 def world_model_training(
     dataset: str, decode_all: bool = True, count: int = 16, steps: int = 24, updates: int = 10
 ) -> dict:
-    """Frames a second of a training step of ``recipes/decoupled.py`` with the paper's plain CNNs, against the same model
+    """Frames a second of a training step of ``recipes/decoupled.py`` with plain CNNs, against the same model
     in plain float32 with LSTM cells in a time loop, which decodes every frame (or as many as the recipe does)."""
     torch.set_num_threads(2)
     episodes = load_dataset(dataset, "train")

@@ -50,7 +50,7 @@ ROWS = {
     "processes": ("two processes of 64 worlds", "one", "steps/s", 1, ">= 1.8", simulation.processes),
     "ppo": ("PPO, time to 97 % success", "Stable-Baselines3 on our Gymnasium id", "s", 1, "<= 0.5", ppo.ppo),
     "training": (
-        "training of the paper's plain CNNs, frames/s", "the same in plain fp32, LSTM cells in a loop", "1/s", 1, ">= 6",
+        "training with plain CNNs, frames/s", "the same in plain fp32, LSTM cells in a loop", "1/s", 1, ">= 6",
         lambda **sizes: learning.world_model_training(DATASET, **sizes),
     ),
     "training_decode_8": (
@@ -108,7 +108,7 @@ def main_job_table(main_jobs: dict) -> str:
 def memory_table(memory: dict) -> str:
     """Return the largest memory of every recipe, all its processes together."""
     lines = [f"| recipe | {memory['unit']} |", "|---|---|"]
-    return "\n".join(lines + [f"| `{name}` | {peak:.1f} |" for name, peak in memory["peak"].items()])
+    return "\n".join(lines + [f"| `{name}` | {peak:.2f} |" for name, peak in memory["peak"].items()])
 
 
 def size_table(sizes: dict) -> str:

@@ -104,13 +104,14 @@ def test_main_cells_and_baselines_are_rows(tmp_path, monkeypatch):
     }
     monkeypatch.setattr(page, "read_cells", lambda *_: cells)
     rates = {"task": "balance_reaching", "rates": {"dropped": 90.6, "success": 9.4}, "episodes": 1000}
+    rates |= {"intervals": {"success": [7.74, 11.36]}}
     (tmp_path / "measurements").mkdir()
     (tmp_path / "measurements/careless_x.json").write_text(json.dumps(rates))
     act = {"policy": "LeRobot", "row": "ACT", "task": "bin_dropping", "test_protocol": summary}
     (tmp_path / "measurements/act_x.json").write_text(json.dumps(act))
     assert markdown_runs(tmp_path).splitlines()[2:] == [
         "| 1 | RGB+[P+V], plain CNN, recurrent | 1 | 3,000 | 1.0 | 12.3 | **97.0** [96.0, 98.0] |",
-        "| 1 | careless |  | 1,000 | 90.6 |  | 9.4 |",
+        "| 1 | careless |  | 1,000 | 90.6 |  | **9.4** [7.7, 11.4] |",
         "| 3 | Only-RGB, recurrent | 1 | 3,000 |  |  | **97.0** [96.0, 98.0] |",
         "| 3 | ACT of LeRobot |  | 3,000 |  |  | **97.0** [96.0, 98.0] |",
     ]

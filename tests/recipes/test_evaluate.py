@@ -49,7 +49,9 @@ def test_task_1s_expert_meets_the_obstacle_of_task_2(tmp_path, monkeypatch):
             output=output,
         )
     )
-    assert read_json(output)["rates"] == rates
+    again = read_json(output)
+    assert again["rates"] == rates
+    assert 100 * again["rows"]["success"].count("1") / len(again["rows"]["success"]) == rates["success"]
 
 
 @pytest.fixture
