@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.data import SliceSampler, Storage, TensorDictReplayBuffer, TensorStorage
+from torchrl.data import ImmutableDatasetWriter, SliceSampler, Storage, TensorDictReplayBuffer, TensorStorage
 
 from .windows import check_length
 
@@ -29,15 +29,21 @@ def as_replay_buffer(
         generator: source of the random numbers; by default torch's own.
 
     Raises:
-        ValueError: the episodes are shorter than ``length``.
+        ValueError: the episodes are not ``[E, T]``, or are shorter than ``length``.
     """
+    if episodes.ndim != 2:
+        raise ValueError(f"episodes must be [E, T], got {list(episodes.shape)}")
     count, steps = episodes.shape
     check_length(length, steps)
     number = torch.arange(count, device=episodes.device)[:, None].expand(count, steps)
     flat = episodes.copy().set("trajectory", number).reshape(-1)
     sampler = _WindowSampler(slice_len=length, traj_key="trajectory", truncated_key=None, cache_values=True)
     return TensorDictReplayBuffer(
-        storage=TensorStorage(flat), sampler=sampler, batch_size=batch, generator=generator
+        storage=TensorStorage(flat),
+        sampler=sampler,
+        writer=ImmutableDatasetWriter(),
+        batch_size=batch,
+        generator=generator,
     )
 
 

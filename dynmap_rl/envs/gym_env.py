@@ -59,7 +59,7 @@ class DynmapEnv(gym.Env):
         bin, and the cart never touched the bin.
 
     Info:
-        ``is_success``, ``dropped``, ``touched`` and ``position_error``, as numpy scalars. ``dropped``: the block was
+        ``is_success``, ``dropped``, ``touched`` and ``position_error``. ``dropped``: the block was
         ever not carried, that is, it leaned over by more than 45 degrees relative to the cart, its centre was below
         half its standing height, or it was beyond the cart's edge. ``touched``: cart or block ever touched the
         obstacle or the bin. ``position_error``: mean distance (m) of cart and goal in the last 10 steps.
@@ -177,10 +177,10 @@ class DynmapEnv(gym.Env):
             return pixels
         return {"pixels": pixels, "agent_pos": self.task.agent_pos(self.world).astype(np.float32)}
 
-    def _info(self) -> dict[str, np.generic]:
+    def _info(self) -> dict[str, bool | np.float32]:
         return {
-            "is_success": np.bool_(self.task.is_success(self.world)),
-            "dropped": np.bool_(self.world.dropped),
-            "touched": np.bool_(self.world.touched),
+            "is_success": bool(self.task.is_success(self.world)),
+            "dropped": bool(self.world.dropped),
+            "touched": bool(self.world.touched),
             "position_error": np.float32(self.world.position_error),
         }

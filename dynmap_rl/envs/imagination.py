@@ -15,6 +15,8 @@ from dynmap_rl.modules.world_model import WorldModel
 from .world_model_transform import WorldModelTransform
 
 STEP_KEYS = ("latent", "predicted_latent", *MEMORY)
+# Entries of a rollout that are not observations.
+OTHERS = "action", "next", "reward", "done", "terminated", "truncated", "is_init"
 
 
 class ImaginationEnv(ModelBasedEnvBase):
@@ -40,7 +42,7 @@ class ImaginationEnv(ModelBasedEnvBase):
     Args:
         world_model: world model that predicts.
         start: TensorDict ``[B]`` with ``latent`` ``[B, Z]``, and optionally ``predicted_latent`` ``[B, Z]`` and the
-            memory, four times ``[B, H]`` (default: zeros).
+            memory, four times ``[B, H]`` (default: zeros). A step of a rollout may be given as it is.
         decode_pixels: decode a frame in each step.
         reward: function from the observations after a step, a TensorDict ``[B]``, to a float32 reward ``[B, 1]``.
 
@@ -64,6 +66,7 @@ class ImaginationEnv(ModelBasedEnvBase):
         device = start["latent"].device
         super().__init__(world_model, device=device, batch_size=start.batch_size)
         self.decode_pixels, self.reward_function = decode_pixels, reward
+        start = start.exclude(*OTHERS)
         keys = [key for key in start.keys(True, True) if key not in STEP_KEYS]
         self.constant = [key for key in keys if key[0] not in ("predicted_dynamics", "reconstruction")]
         with torch.no_grad():

@@ -37,13 +37,21 @@ class Renderer:
         size: side of the frame in pixels.
         supersample: factor by which the picture is drawn larger and then averaged; 1 gives hard edges, as in the
             paper.
+
+    Raises:
+        ValueError: the size or the factor is not positive.
     """
 
     def __init__(self, size: int = 64, supersample: int = 1):
+        if min(size, supersample) < 1:
+            raise ValueError(f"size and supersample must be at least 1, got {size} and {supersample}")
         self.size = size
         self.scale = size * supersample
         self.canvas = pygame.Surface((self.scale, self.scale), 0, 24, RGB)
         self.frame = pygame.Surface((size, size), 0, 24, RGB) if supersample > 1 else self.canvas
+
+    def __reduce__(self) -> tuple:
+        return Renderer, (self.size, self.scale // self.size)  # pygame's surfaces cannot be copied
 
     def draw(self, world: World, task: Marked) -> np.ndarray:
         """Draw the frame, uint8 ``[size, size, 3]`` (height, width, RGB)."""

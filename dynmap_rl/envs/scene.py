@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
+from numbers import Real
 from typing import ClassVar
 
 import numpy as np
@@ -25,7 +26,8 @@ class Scene:
     ``cart_x, cart_y`` is the cart's centre, ``block_shift`` the block's offset from it along the cart.
 
     Raises:
-        ValueError: a size or the density is not positive, or the block's centre is beside the cart.
+        ValueError: a size or the density is not positive, a place is not in the picture, or the block's centre is beside
+            the cart.
     """
 
     cart_width: float = 0.25
@@ -44,9 +46,15 @@ class Scene:
     background_color: Color = (230, 230, 230)
 
     def __post_init__(self):
-        for f in fields(self):
-            if f.name.endswith(SIZES) and not getattr(self, f.name) > 0:
-                raise ValueError(f"{f.name} of the scene must be positive, got {getattr(self, f.name)}")
+        for name, value in vars(self).items():
+            if name.endswith("_color"):
+                continue
+            if not isinstance(value, Real):
+                raise ValueError(f"{name} of the scene must be a number, got {value!r}")
+            if name.endswith(SIZES) and not value > 0:
+                raise ValueError(f"{name} of the scene must be positive, got {value}")
+            if name.endswith(("_x", "_y")) and not 0 <= value <= 1:
+                raise ValueError(f"{name} of the scene must be 0 to 1 m, got {value}")
         if 2 * abs(self.block_shift) > self.cart_width:
             half = self.cart_width / 2
             raise ValueError(
@@ -213,6 +221,6 @@ def choose_ranges(own: SceneRanges | None, ranges: SceneRanges | None) -> SceneR
         return own
     if own is None:
         raise ValueError("ranges have no effect in a task without ranges; leave them out")
-    if not issubclass(ranges.scene, own.scene):
+    if not isinstance(ranges, SceneRanges) or not issubclass(ranges.scene, own.scene):
         raise ValueError(f"ranges must be {type(own).__name__} in this task, got {type(ranges).__name__}")
     return ranges

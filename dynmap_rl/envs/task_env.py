@@ -56,7 +56,13 @@ class TaskEnv(gym.Env):
         self._draw, self.world = self.task.make_renderer(), None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
-        """Begin the episode of a scene seed; without one, of a random seed."""
+        """Begin the episode of a scene seed; without one, of a random seed.
+
+        Raises:
+            ValueError: there are options, which scenes of this environment do not have.
+        """
+        if options:
+            raise ValueError(f"this environment has no reset options, got {sorted(options)}")
         super().reset(seed=seed)
         scene_seed = int(self.np_random.integers(2**63)) if seed is None else seed
         self.world = self.task.begin(scene_seed, None, self.world)
@@ -83,11 +89,11 @@ class TaskEnv(gym.Env):
         pixels = {name: np.ascontiguousarray(frame) for name, frame in zip(cameras, frames, strict=True)}
         return {"pixels": pixels, "agent_pos": np.asarray(self.task.agent_pos(self.world), np.float32)}
 
-    def _info(self) -> dict[str, np.generic]:
+    def _info(self) -> dict[str, bool | np.float32]:
         world = self.world
         ended = world.steps >= self._max_episode_steps
         return {
-            "is_success": np.bool_(ended and self.task.is_success(world)),
-            "dropped": np.bool_(world.dropped),
+            "is_success": bool(ended and self.task.is_success(world)),
+            "dropped": bool(world.dropped),
             "position_error": np.float32(world.position_error),
         }

@@ -126,6 +126,8 @@ class DynmapBatchedEnv(EnvBase):
         scene_seed: torch.Tensor | None = None,
         **kwargs,
     ) -> TensorDictBase:
+        if kwargs:
+            raise TypeError(f"reset takes seed and scene_seed, got {', '.join(sorted(kwargs))}")
         n = self.batch_size[0]
         mask = torch.ones(n, dtype=torch.bool)
         seeds = scene_seed
@@ -138,6 +140,8 @@ class DynmapBatchedEnv(EnvBase):
                 f"scene_seed must have shape ({n},), one seed for each world, got {shape}; "
                 "pass those of a ParallelEnv as list_of_kwargs"
             )
+        if seeds is not None and torch.as_tensor(seeds).is_floating_point():
+            raise ValueError("scene_seed must be integers")
         rows = mask.nonzero().flatten().tolist()
         for i in rows:
             seed = int(seeds[i]) if seeds is not None else int(self.rng.integers(2**63))
@@ -150,6 +154,8 @@ class DynmapBatchedEnv(EnvBase):
         return self._observation.clone()
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if None in self.worlds:
+            raise RuntimeError("the environment has not begun; call reset first")
         actions = tensordict["action"].detach().cpu().numpy()
         if self.control == "acceleration":
             actions = [world.action_for(a) for world, a in zip(self.worlds, actions, strict=True)]

@@ -231,7 +231,9 @@ def limit_actions(worlds: Sequence[World], actions: Sequence[np.ndarray]) -> np.
     commanded = np.array([world.commanded for world in worlds])
     wanted = np.array(actions, dtype=np.float64)
     if wanted.shape != last.shape or not np.isfinite(wanted).all():
-        raise ValueError(f"an action must be 3 finite numbers (dX, dY, dTheta), got {wanted}")
+        raise ValueError(
+            f"an action must be 3 finite numbers (dX, dY, dTheta) for each of {len(last)} worlds, got {wanted}"
+        )
     room = np.maximum(WAYS * commanded + EDGES, 0.0)  # [2, N, 3]
     speed = np.sqrt(HALF_SQUARED + TWICE * room) - HALF_BRAKE
     back, forth = np.minimum(speed, VELOCITY_LIMIT) * CONTROL_DT

@@ -36,6 +36,9 @@ class WorldModelTransform(Transform):
             world models are trained, also in an environment whose actions are accelerations. Windows need the key
             under ``next``, too.
         mixed: encode in the precision of training (see :meth:`dynmap_rl.modules.WorldModel.encode`).
+
+    Raises:
+        ValueError: the environment has no uint8 frames, or a TensorDict outside of an environment no windows.
     """
 
     def __init__(
@@ -59,7 +62,12 @@ class WorldModelTransform(Transform):
         # TorchRL keeps the old entries of the worlds that are not reset, so these need no encoding.
         batch = tensordict_reset.batch_size
         mask = tensordict.get("_reset", torch.ones(batch, dtype=torch.bool)).reshape(batch)
-        pixels = tensordict_reset[self.in_keys[0]]
+        pixels = tensordict_reset.get(self.in_keys[0], None)
+        if pixels is None or pixels.dtype != torch.uint8:
+            raise ValueError(
+                f"{self.in_keys[0]} must be uint8 frames [..., 3, S, cameras * S] of the environment: make it with "
+                "from_pixels=True, and leave ToTensorImage out"
+            )
         latent, *zeros = (torch.zeros(*batch, size, device=pixels.device) for size in self._sizes().values())
         latent[mask] = self.world_model.encode(pixels[mask], self.mixed)
         return self._write(tensordict_reset, latent, *zeros)

@@ -8,6 +8,7 @@ from functools import partial
 from itertools import chain
 
 import torch
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
@@ -28,7 +29,7 @@ BATCH = 100  # episodes of a batch on a CPU; larger ones are little faster, and 
 
 
 def evaluate(
-    actor: TensorDictModuleBase,
+    actor: Callable[[TensorDict], TensorDict],
     task: str,
     settings: Evaluation | None = None,
     delay: FrameDelay | None = None,

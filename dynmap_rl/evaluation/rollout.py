@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModuleBase
+from torch import nn
 from torchrl.envs import Compose, RenameTransform, TransformedEnv
 from torchrl.envs.utils import step_mdp
 from tqdm import tqdm
@@ -26,9 +26,9 @@ EVENTS = tuple(("next", key) for key in ("position_error", "dropped", "touched",
 
 @torch.no_grad()
 def roll_out(
-    actor: TensorDictModuleBase,
+    actor: Callable[[TensorDict], TensorDict],
     task: str,
-    seeds: list[int],
+    seeds: Sequence[int],
     keep_pixels: bool = False,
     delay: FrameDelay | None = None,
     pushed: bool = False,
@@ -39,8 +39,8 @@ def roll_out(
     All episodes are one batch or, where a task limits its worlds, a few batches.
 
     Args:
-        actor: reads ``pixels``, ``goal`` or ``agent_pos`` and writes ``action``, as :class:`dynmap_rl.modules.Actor`
-            does.
+        actor: callable that reads ``pixels``, ``goal``, ``agent_pos`` or ``is_init`` of a TensorDict ``[E]`` and writes
+            ``action``, as :class:`dynmap_rl.modules.Actor` does. What it writes under ``next`` is there in the next step.
         task: name of the task.
         seeds: seeds of the scenes.
         keep_pixels: keep the frames in the result, each at the step at which it was taken.
@@ -55,8 +55,8 @@ def roll_out(
         ``("next", "position_error" | "dropped" | "touched" | "is_success")``. ``("predicted_dynamics", quantity)`` is the
         one-step prediction of the actor's world model at t, zero at t = 0, for each quantity that it decodes.
     """
-    actor = actor.eval()
-    rules, device = get_task(task), find_device(actor)
+    module = actor if isinstance(actor, nn.Module) else nn.Module()
+    seeds, rules, device = [int(seed) for seed in seeds], get_task(task), find_device(actor)
     size = min(len(seeds), rules.max_worlds or len(seeds))
     env = DynmapBatchedEnv(task, size, from_pixels=True, include_state=False, device=device)
     parts, title = [], f"{len(seeds)} episodes" if progress else None
@@ -64,19 +64,34 @@ def roll_out(
         some = seeds[start : start + size]
         full = some + seeds[: size - len(some)]  # a batch always has the same size
         plans = [Plan(seed, "", pushes=draw_pushes(seed, rules.pushes * pushed)) for seed in full]
-        with reuse_still_frames(actor) if device.type == "cpu" else nullcontext():
+        still = reuse_still_frames(module) if device.type == "cpu" else nullcontext()
+        with evaluation_mode(module), still:
             episodes = _roll_out(actor, env, plans, keep_pixels, delay, title)
         parts.append(episodes[: len(some)])
     return torch.cat(parts)
 
 
-def find_device(actor: TensorDictModuleBase) -> torch.device:
+@contextmanager
+def evaluation_mode(module: nn.Module) -> Iterator[None]:
+    """Set all parts of a module to evaluation, and back to what they were at the end."""
+    modes = {part: part.training for part in module.modules()}
+    try:
+        for part in modes:
+            part.training = False
+        yield
+    finally:
+        for part, training in modes.items():
+            part.training = training
+
+
+def find_device(actor: Callable) -> torch.device:
     """Return the device of an actor; the CPU of one without parameters."""
-    return next((parameter.device for parameter in actor.parameters()), torch.device("cpu"))
+    parameters = actor.parameters() if isinstance(actor, nn.Module) else ()
+    return next((parameter.device for parameter in parameters), torch.device("cpu"))
 
 
 def _roll_out(
-    actor: TensorDictModuleBase,
+    actor: Callable[[TensorDict], TensorDict],
     env: DynmapBatchedEnv,
     plans: list[Plan],
     keep_pixels: bool,
@@ -100,7 +115,8 @@ def _roll_out(
     bar = {} if title else {"disable": True}  # False would override TQDM_DISABLE
     for t in tqdm(range(env.layout.steps), title, unit="step", leave=False, **bar):
         dynamics = env.read_dynamics()
-        td = actor(td)
+        td["is_init"] = torch.full((count, 1), t == 0, device=device)
+        td = td.update(actor(td))
         if pushed:
             action = td["action"].double().cpu().numpy()
             push(t, action, plans, env.worlds)

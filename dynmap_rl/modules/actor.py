@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from tensordict.utils import NestedKey, unravel_key
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import TensorDictPrimer
+from torchrl.modules import recurrent_mode
 
 from .policy import FeedforwardPolicy, RecurrentPolicy
 from .world_model import WorldModel
@@ -225,11 +228,29 @@ class Actor(TensorDictModuleBase):
 
 
 def _recall(tensordict: TensorDictBase, sizes: dict, is_init: NestedKey, device) -> tuple[torch.Tensor, ...]:
-    """Return the entries of ``sizes``; zeros where they are absent and where an episode begins."""
-    batch = tensordict.batch_size
+    """Return the entries of ``sizes``; zeros where an episode begins, and where they and ``is_init`` are absent."""
+    batch, begins = tensordict.batch_size, tensordict.get(is_init, None)
+    check_memory(tensordict, sizes, begins)
     state = tuple(tensordict.get(k, torch.zeros(*batch, n, device=device)) for k, n in sizes.items())
-    begins = tensordict.get(is_init, None)
     return state if begins is None else tuple(s.masked_fill(begins, 0.0) for s in state)
+
+
+def check_memory(tensordict: TensorDictBase, keys: Iterable[NestedKey], begins: torch.Tensor | None) -> None:
+    """Check that memory is there, except where episodes begin, and that the call is of one time step.
+
+    Raises:
+        KeyError: the environment does not pass the memory on.
+        RuntimeError: TorchRL's recurrent mode is on, in which modules read whole windows.
+    """
+    if recurrent_mode():
+        raise RuntimeError(
+            "an actor reads one time step; windows are for make_world_model_module and make_policy_module"
+        )
+    missing = [key for key in keys if tensordict.get(key, None) is None]
+    if missing and begins is not None and not begins.all():
+        raise KeyError(
+            f"{missing[0]} is missing after the first step; append actor.make_tensordict_primer() to the environment"
+        )
 
 
 def remember(tensordict: TensorDictBase, keys, values) -> None:

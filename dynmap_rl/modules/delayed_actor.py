@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey, unravel_key
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import TensorDictPrimer
 
-from .actor import MEMORY, Actor, remember
+from .actor import MEMORY, Actor, check_memory, remember
 from .world_model import WorldModel
 
 BASE = ("predicted_latent", *MEMORY)  # state of the world model before the oldest step that is remembered
@@ -131,6 +131,7 @@ class DelayedActor(TensorDictModuleBase):
     def _recall(self, tensordict: TensorDictBase) -> TensorDict:
         """Return a copy of the history, which is empty where it is absent and where an episode begins."""
         history, begins = tensordict.get(self.history, None), tensordict.get(self.actor.is_init, None)
+        check_memory(tensordict, [self.history], begins)
         if history is None:
             batch, device = tensordict.batch_size, next(self.parameters()).device
             zeros = {

@@ -24,11 +24,16 @@ class Encoder(nn.Module):
         """Encode frames ``[..., 3, S, S]`` in 0..255, uint8 or float, as latents ``[..., Z]``.
 
         Raises:
-            ValueError: the frames have another shape.
+            ValueError: the frames have another shape, or are floats in 0..1.
         """
         side = self.image_size
         if pixels.shape[-3:] != (3, side, side):
             raise ValueError(f"pixels must be [..., 3, {side}, {side}], got {list(pixels.shape)}")
+        # A frame in 0..1 would be read as a black one.
+        if pixels.is_floating_point() and not torch.compiler.is_compiling() and 0 < pixels.amax() <= 1:
+            raise ValueError(
+                "pixels must be in 0..255, got floats in 0..1; give uint8 frames, without ToTensorImage"
+            )
         x = pixels.reshape(-1, 3, side, side)
         # Without gradients, chunks that fit into the processor's cache are twice as fast.
         chunks = (x,) if torch.is_grad_enabled() else x.split(64)

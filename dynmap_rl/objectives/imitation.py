@@ -15,6 +15,8 @@ from torchrl.objectives.common import LossModule
 from dynmap_rl.modules.normalization import Normalizer
 from dynmap_rl.modules.policy import FeedforwardPolicy, RecurrentPolicy
 
+from .windows import check_windows
+
 
 def imitation_loss(
     predicted: torch.Tensor,
@@ -88,8 +90,12 @@ class ImitationLoss(LossModule):
     Output: ``loss_policy``, a scalar.
 
     Args:
-        policy: policy to train.
+        policy: policy to train; any module with the same inputs whose ``action`` is the normalizer of its actions.
         emphasis: see :func:`imitation_loss`.
+
+    Raises:
+        TypeError: the policy has no ``action``.
+        ValueError: the input is not windows ``[B, T]`` of one episode each.
     """
 
     @dataclass
@@ -107,6 +113,8 @@ class ImitationLoss(LossModule):
 
     def __init__(self, policy: FeedforwardPolicy | RecurrentPolicy, emphasis: float = 0.0):
         super().__init__()
+        if not isinstance(getattr(policy, "action", None), Normalizer):
+            raise TypeError(f"policy must have a Normalizer as its action, got {type(policy).__name__}")
         self.policy, self.emphasis = policy, emphasis
 
     @property
@@ -123,6 +131,7 @@ class ImitationLoss(LossModule):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Return the loss."""
+        check_windows(tensordict)
         keys = self.tensor_keys
         states = (tensordict[key] for key in self.in_keys[:-1])
         masks = self._loss_mask_keys()

@@ -14,6 +14,7 @@ from dynmap_rl.modules.policy import FeedforwardPolicy, RecurrentPolicy
 from dynmap_rl.utils.ranks import mean_over_ranks
 
 from .imitation import find_target, imitation_loss
+from .windows import check_windows
 from .world_model import WorldModelLoss
 
 
@@ -36,7 +37,8 @@ class JointLoss(LossModule):
         end_to_end: minimise the policy's loss alone (Eq. 3).
 
     Raises:
-        ValueError: ``world_model_loss`` has ``imagined``: a policy's states are those of the frames.
+        ValueError: the input is not windows ``[B, T]`` of one episode each, or ``world_model_loss`` has ``imagined``: a
+            policy's states are those of the frames.
     """
 
     @dataclass
@@ -96,6 +98,7 @@ class JointLoss(LossModule):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Return the losses."""
+        check_windows(tensordict, steps=1 if self.end_to_end else 2)
         latent, states = self.world_model_loss.predict(tensordict)
         losses = {} if self.end_to_end else self.world_model_loss.compare(tensordict, latent, states)
         predicted = self.policy(latent, *states[1:], tensordict[self.tensor_keys.goal])

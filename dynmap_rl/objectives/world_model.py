@@ -14,6 +14,8 @@ from dynmap_rl.modules.layers import color_weights
 from dynmap_rl.modules.world_model import WorldModel
 from dynmap_rl.utils.ranks import mean_over_ranks, ranks
 
+from .windows import check_windows
+
 
 class WorldModelLoss(LossModule):
     """Losses of Eq. 4a and 5 on windows of frames, actions and dynamics.
@@ -44,6 +46,10 @@ class WorldModelLoss(LossModule):
         beta_rgb: weight of ``loss_rgb``; with 0, no frames are decoded and this loss is missing.
         rgb_frames: number of random frames of the batch that are decoded; None decodes all.
         generator: generator that draws these frames and steps; by default torch's own.
+
+    Raises:
+        TypeError: ``world_model`` is none.
+        ValueError: the input is not windows ``[B, T]``, T >= 2, of one episode each.
     """
 
     @dataclass
@@ -69,6 +75,8 @@ class WorldModelLoss(LossModule):
         generator: torch.Generator | None = None,
     ):
         super().__init__()
+        if not isinstance(world_model, WorldModel):
+            raise TypeError(f"world_model must be a WorldModel, got {type(world_model).__name__}")
         self.world_model, self.generator = world_model, generator
         self.beta_z, self.beta_dynamics = beta_z, beta_dynamics
         self.stop_gradient, self.rarity = stop_gradient, rarity
@@ -90,6 +98,7 @@ class WorldModelLoss(LossModule):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Return the losses."""
+        check_windows(tensordict, steps=2)
         latent, states = self.predict(tensordict)
         read = latent
         if blind := round(self.imagined * len(latent)):

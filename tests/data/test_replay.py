@@ -94,3 +94,10 @@ def test_torchrls_own_buffer_and_losses_take_loaded_episodes(recording):
     losses = loss(sample)
     assert all(losses[name].isfinite() for name in ("loss_actor", "loss_qvalue"))
     assert BCLoss(actor)(sample)["loss_bc"].isfinite()
+
+
+def test_episodes_have_two_axes_and_are_not_overwritten(episodes):
+    with pytest.raises(ValueError, match=r"\[E, T\]"):
+        as_replay_buffer(episodes.reshape(-1), 2, 3)
+    with pytest.raises(RuntimeError):
+        as_replay_buffer(episodes, 2, 3).extend(episodes.reshape(-1))

@@ -8,6 +8,8 @@ from torchrl.envs import Compose, InitTracker, RenameTransform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from dynmap_rl.envs.imagination import ImaginationEnv, make_start
+from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
+from dynmap_rl.envs.world_model_transform import WorldModelTransform
 from dynmap_rl.modules.actor import MEMORY, LatentActor, make_policy_module
 from dynmap_rl.modules.checkpoints import make_policy, make_world_model
 from dynmap_rl.modules.normalization import Normalizer
@@ -156,3 +158,11 @@ def test_other_names_by_torchrl_s_own_transform(frames):
     ours = env.rollout(5, lambda td: td.set("action", 0.01 * torch.tanh(td["latent"][:, :3])))
     for name, key in zip(names, nested, strict=True):
         assert torch.equal(theirs["next", *key], ours["next", name])
+
+
+def test_a_step_of_a_rollout_is_a_start():
+    transforms = Compose(InitTracker(), WorldModelTransform(make_model()))
+    step = TransformedEnv(DynmapBatchedEnv(num_envs=2, from_pixels=True), transforms).rollout(3)[:, -1]
+    imagined = ImaginationEnv(make_model(), step)
+    check_env_specs(imagined)
+    torch.testing.assert_close(imagined.reset()["hidden1"], step["hidden1"])

@@ -15,6 +15,7 @@ from dynmap_rl.envs.scene import (
     ObstacleScene,
     Scene,
     SceneRanges,
+    choose_ranges,
     sample_scene,
     scene_seed,
 )
@@ -144,3 +145,14 @@ def test_unknown_factor_raises():
 def test_impossible_scene_raises(kind, factor):
     with pytest.raises(ValueError, match=next(iter(factor))):
         kind(**factor)
+
+
+@pytest.mark.parametrize("factor", [{"goal_x": 7.0}, {"cart_y": -0.1}, {"goal_x": "0.7"}, {"density": None}])
+def test_impossible_factors_are_refused(factor):
+    with pytest.raises(ValueError, match=next(iter(factor))):
+        Scene().replace(**factor)
+
+
+def test_ranges_are_ranges():
+    with pytest.raises(ValueError, match="SceneRanges in this task, got dict"):
+        choose_ranges(SceneRanges(), {"density": (1, 2)})

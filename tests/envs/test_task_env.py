@@ -46,3 +46,8 @@ def test_success_is_reported_in_the_last_step_alone(own_task):  # noqa: F811
     assert env.render().shape == (256, 256, 3) and env.metadata["render_fps"] == 20
     with pytest.raises(ValueError, match="render_mode"):
         TaskEnv(own_task, render_mode="human")
+
+
+def test_options_that_would_have_no_effect_are_refused():
+    with pytest.raises(ValueError, match="goal_x"):
+        TaskEnv("balance_reaching").reset(seed=0, options={"goal_x": 0.7})

@@ -1,5 +1,7 @@
 """The batched TorchRL environment: its specs, its resets, and its agreement with the Gymnasium ids."""
 
+import copy
+import pickle
 import re
 from dataclasses import replace
 from functools import partial
@@ -266,3 +268,21 @@ def test_invalid_action_raises():
     env = DynmapBatchedEnv(num_envs=2)
     with pytest.raises(ValueError, match="3 finite numbers"):
         env.step(env.reset().set("action", torch.full((2, 3), torch.nan)))
+
+
+def test_what_a_reset_does_not_know_is_refused():
+    env = DynmapBatchedEnv(num_envs=2)
+    with pytest.raises(RuntimeError, match="call reset first"):
+        env.step(TensorDict({"action": torch.zeros(2, 3)}, [2]))
+    with pytest.raises(TypeError, match="options"):
+        env.reset(options={"goal_x": 0.7})
+    with pytest.raises(ValueError, match="integers"):
+        env.reset(scene_seed=torch.tensor([0.5, 1.5]))
+
+
+def test_an_environment_with_frames_can_be_copied_and_pickled():
+    env = DynmapBatchedEnv(num_envs=2, from_pixels=True)
+    env.reset(scene_seed=torch.tensor([1, 2]))
+    for other in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
+        same = other.reset(scene_seed=torch.tensor([1, 2]))
+        assert torch.equal(same["pixels"], env.reset(scene_seed=torch.tensor([1, 2]))["pixels"])

@@ -7,7 +7,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector, Evaluator
-from torchrl.envs import Compose, InitTracker, ParallelEnv, TransformedEnv
+from torchrl.envs import Compose, InitTracker, ParallelEnv, ToTensorImage, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from dynmap_rl.envs.task import LAYOUT, Task
@@ -218,3 +218,12 @@ def test_in_processes_of_their_own(make):
         check_env_specs(outer)
     finally:
         env.close()
+
+
+def test_an_environment_without_uint8_frames_is_refused():
+    for env in (
+        DynmapBatchedEnv(),
+        TransformedEnv(DynmapBatchedEnv(from_pixels=True), ToTensorImage(shape_tolerant=True)),
+    ):
+        with pytest.raises(ValueError, match="uint8 frames"):
+            TransformedEnv(env, WorldModelTransform(make_model())).rollout(2)

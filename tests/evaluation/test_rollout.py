@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torchrl.modules import LSTMModule
 
 from dynmap_rl.data.recording.plans import draw_pushes
 from dynmap_rl.envs.delay import FrameDelay
@@ -50,6 +51,33 @@ def test_an_actor_may_have_no_parameters():
     still = TensorDictModule(lambda agent_pos: torch.zeros(len(agent_pos), 3), ["agent_pos"], ["action"])
     result = evaluate(still, "balance_reaching", Evaluation(episodes=2, paper_episodes=0))
     assert result["test"]["summary"]["SR"] == 0
+
+
+def counter():
+    """Return a callable that remembers the time step under a key of its own."""
+
+    def act(td):
+        step = torch.where(td["is_init"], 0, td.get("step", torch.zeros(len(td), 1, dtype=torch.int64)))
+        out = TensorDict({"action": 0.001 * step.float().expand(-1, 3) / 100}, td.batch_size)
+        return out.set(("next", "step"), step + 1)
+
+    return act
+
+
+@pytest.mark.parametrize("seeds", [range(2), np.arange(2), torch.arange(2), [0, 1]])
+def test_any_callable_is_rolled_out_from_any_seeds(seeds):
+    out = roll_out(counter(), "balance_reaching", seeds)
+    torch.testing.assert_close(out["action"][0, :4, 0], torch.tensor([0.0, 1e-5, 2e-5, 3e-5]))
+    assert evaluate(counter(), "balance_reaching", Evaluation(episodes=1, paper_episodes=0))
+
+
+def test_torchrl_s_lstm_is_rolled_out():
+    lstm = LSTMModule(5, 8, in_key="agent_pos", out_key="x")
+    actor = TensorDictSequential(lstm, TensorDictModule(torch.nn.Linear(8, 3), ["x"], ["action"]))
+    actor.train()
+    lstm.eval()
+    assert roll_out(actor, "balance_reaching", [0]).shape == (1, EPISODE_STEPS)
+    assert actor.training and not lstm.training, "modes are as before"
 
 
 @pytest.mark.parametrize("make", [lambda: DelayedActor(make_actor(), max_delay=5), make_actor])

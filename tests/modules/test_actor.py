@@ -7,11 +7,13 @@ from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, InitTracker, TransformedEnv
 from torchrl.envs.utils import check_env_specs
+from torchrl.modules import set_recurrent_mode
 
 from dynmap_rl.envs.imagination import ImaginationEnv, make_start
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.modules.actor import MEMORY, POLICY_MEMORY, Actor, LatentActor
 from dynmap_rl.modules.checkpoints import make_policy
+from dynmap_rl.modules.delayed_actor import DelayedActor
 
 both_kinds = pytest.mark.parametrize("kind", ["feedforward", "recurrent"])
 
@@ -137,3 +139,15 @@ def test_actor_runs_in_a_collector():
     frames = [batch.numel() for batch in collector]
     collector.shutdown()
     assert frames == [20, 20]
+
+
+@pytest.mark.parametrize("make", [make_actor, lambda: DelayedActor(make_actor(), max_delay=2)])
+def test_an_environment_that_does_not_pass_the_memory_on_is_refused(make):
+    env = TransformedEnv(DynmapBatchedEnv(num_envs=2, from_pixels=True), InitTracker())
+    with pytest.raises(KeyError, match="make_tensordict_primer"):
+        env.rollout(3, make())
+
+
+def test_windows_are_refused_in_recurrent_mode():
+    with set_recurrent_mode(True), pytest.raises(RuntimeError, match="make_world_model_module"):
+        make_actor()(make_frames())

@@ -92,3 +92,11 @@ def test_attention_reads_position_and_colour_of_the_place_it_looks_at():
 def test_a_compiled_encoder_gives_the_same(make):
     encoder, frames = make(16), torch.randint(0, 256, (2, 3, 64, 64), dtype=torch.uint8)
     torch.testing.assert_close(torch.compile(encoder)(frames), encoder(frames), rtol=1e-4, atol=1e-4)
+
+
+def test_floats_in_0_to_1_are_refused():
+    encoder = PlainEncoder()
+    frames = torch.randint(0, 256, (2, 3, 64, 64), dtype=torch.uint8)
+    torch.testing.assert_close(encoder(frames.float()), encoder(frames), rtol=1e-4, atol=1e-4)
+    with pytest.raises(ValueError, match="0..255"):
+        encoder(frames / 255)

@@ -129,3 +129,24 @@ def test_a_mask_without_valid_steps_gives_zero_with_few_decoded_frames(td):
     loss = make("world model", rgb_frames=2)
     td["collector", "mask"] = torch.zeros(B, T, dtype=torch.bool)
     assert all(value == 0 for value in loss(td).values())
+
+
+@every_loss
+def test_other_input_than_windows_of_one_episode_is_refused(name, td):
+    loss = make(name)
+    for wrong in (td.reshape(-1), td[0], td[:, :0]):
+        with pytest.raises(ValueError, match="windows"):
+            loss(wrong)
+    begins = torch.zeros(B, T, 1, dtype=torch.bool)
+    begins[0, 0] = True
+    loss(td.set("is_init", begins))
+    begins[0, 3] = True
+    with pytest.raises(ValueError, match="one episode"):
+        loss(td)
+
+
+def test_losses_name_what_they_need():
+    with pytest.raises(TypeError, match="WorldModel"):
+        WorldModelLoss(torch.nn.Linear(2, 2))
+    with pytest.raises(TypeError, match="Normalizer"):
+        ImitationLoss(torch.nn.Linear(2, 2))

@@ -1,0 +1,26 @@
+"""What losses ask of their windows."""
+
+from __future__ import annotations
+
+from tensordict import TensorDictBase
+
+
+def check_windows(tensordict: TensorDictBase, steps: int = 1) -> None:
+    """Check that a TensorDict holds windows ``[B, T]`` of one episode each.
+
+    Args:
+        tensordict: input of a loss.
+        steps: smallest T.
+
+    Raises:
+        ValueError: there are more or fewer batch axes, too few steps, or ``is_init`` after a first step.
+    """
+    shape = list(tensordict.shape)
+    if len(shape) != 2 or shape[1] < steps:
+        raise ValueError(
+            f"a loss needs windows [B, T] with T of at least {steps}, got {shape}; sample.reshape(-1, T) makes them of a "
+            "flat sample of slices"
+        )
+    begins = tensordict.get("is_init", None)
+    if begins is not None and begins[:, 1:].any():
+        raise ValueError("a window must lie in one episode, but is_init is true after its first step")
