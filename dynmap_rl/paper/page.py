@@ -16,6 +16,7 @@ from .tables import OWN, join_table, markdown_column, markdown_overview, markdow
 
 UNITS = {"DR": "%", "PE": "mm"}
 PERCEPTION = "object_error", "chroma_explained", "goal_explained", "background_error"
+HEAD = ["", "on", "colour error", "chroma", "goal", "background", "cart", "open loop: cart, block"]
 MAIN = "RGB+[P+V]", "Only-RGB"  # rows of the table in the main README
 MARKS = "<!-- results -->", "<!-- /results -->"
 COMMAND = "python recipes/paper/tables.py --write"
@@ -90,6 +91,14 @@ deviation on either side. Equal rates have none, since they do not say how much 
 
 {own}
 
+### What the ablations' world models predict
+
+The first world model of each row: success on task 2 with frames 500 ms late, rolled forward, on 500 validation scenes (one
+policy; 95 % interval over scenes); and on held-out demonstrations, what stands under
+[what world models see](#what-world-models-see). Rows that differ in the policy alone have the default's world model.
+
+{ablations}
+
 ## What fails
 
 Failed episodes of the first policy of as many world models as the row says, run again
@@ -140,6 +149,7 @@ def markdown_page(results: Path) -> str:
         comparisons=markdown_comparisons(comparisons),
         columns="\n\n".join(columns),
         own="\n\n".join(f"### {what}\n\n{markdown_own(cells, table)}" for table, what in OWN.items()),
+        ablations=markdown_ablations(read_json(results / "measurements" / "ablations.json")),
         failures=_failures(results / "measurements" / "failures.json"),
         perception=markdown_perception(read_json(results / "measurements" / "probe.json")),
         media="\n\n".join(f"![{text}](media/{name})\n\n{text}" for name, text in contents["media"].items()),
@@ -160,8 +170,27 @@ def markdown_perception(probe: dict) -> str:
                 name, where, *(f"{found[key]:.2f}" for key in PERCEPTION), f"{1000 * found['cart_error']:.1f} mm",
                 f"{last['cart_mm']:.1f} mm, {last['block_mm']:.1f} mm" if held_out else "",
             ])  # fmt: skip
-    head = ["", "on", "colour error", "chroma", "goal", "background", "cart", "open loop: cart, block"]
-    return join_table(head, lines)
+    return join_table(HEAD, lines)
+
+
+def markdown_ablations(found: dict) -> str:
+    """Return a table of the measurements of the ablations' world models.
+
+    Args:
+        found: ``late``, the evaluation of each row's policy on late frames, and ``world_models``, for each row with a
+            world model of its own the entries of ``probe.json`` (see ``recipes/probe.py``): ``perception`` on held-out
+            demonstrations, and ``open_loop``.
+    """
+    lines = []
+    for row, late in found["late"].items():
+        low, high = late["SR_interval"]
+        line = [row, f"{late['DR']:.1f}", f"**{late['SR']:.1f}** [{low:.1f}, {high:.1f}]"]
+        if probe := found["world_models"].get(row):
+            line += [f"{probe[key]:.2f}" for key in PERCEPTION]
+            line += [f"{1000 * probe['cart_error']:.1f} mm"]
+            line += [f"{probe['cart_mm']:.0f} mm, {probe['block_mm']:.0f} mm"]
+        lines.append(line + [""] * (len(HEAD) - len(line) + 1))
+    return join_table(["", "DR, late frames", "SR, late frames", *HEAD[2:]], lines)
 
 
 def markdown_runs(results: Path) -> str:
