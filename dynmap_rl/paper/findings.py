@@ -13,7 +13,7 @@ from dynmap_rl.evaluation.statistics import paired_interval, rate_gap, welch_int
 
 from .cells import TASKS, Key
 from .results import ROWS, Cell
-from .tables import join_table
+from .tables import join_table, p_text
 
 ONE, TWO, THREE = TASKS
 DYNAMICS_ROWS = [row for row in ROWS if row.startswith("RGB+")]
@@ -232,7 +232,7 @@ def _comparison_row(row: dict) -> list[str]:
         row["comparison"],
         " - ".join(f"{rate:.1f}" for rate in row["rates"]),
         f"{row['gap']:+.1f} [{low:.1f}, {high:.1f}]",
-        f"{row['p']:.3f}" if row["p"] >= 0.001 else "< 0.001",
+        p_text(row["p"]),
         "[{:.1f}, {:.1f}]".format(*row["trainings"]) if row["trainings"] else "-",
         f"{row['scenes']:,}",
         " - ".join(map(str, row["world_models"])),

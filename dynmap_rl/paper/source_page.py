@@ -15,7 +15,7 @@ from .source_results import (
     rank_correlations,
     source_table,
 )
-from .tables import join_table
+from .tables import join_table, p_text
 
 FORMS = {"glimpse": "the default encoder and decoder", "plain": "a plain CNN"}
 
@@ -44,7 +44,7 @@ def write_source_page(results: Path, tasks: list[str], architecture: str = "glim
             plot(results, task, written[-1])
             parts.append(f"![{name}]({written[-1].name})")
         rows = [
-            [name, f"{row['rho']:.2f}", f"{row['p']:.2g}", str(row["sources"])]
+            [name, f"{row['rho']:.2f}", p_text(row["p"]), str(row["sources"])]
             for name, row in rank_correlations(results, task).items()
         ]
         if rows:

@@ -119,6 +119,11 @@ def markdown_tables(cells: Mapping[Key, Cell]) -> str:
     return "\n\n".join(parts)
 
 
+def p_text(p: float) -> str:
+    """Return a probability with three digits."""
+    return f"{p:.3f}" if p >= 0.001 else "< 0.001"
+
+
 def join_table(head: list[str], rows: list[list[str]]) -> str:
     """Return a table in Markdown.
 
