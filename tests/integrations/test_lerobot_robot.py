@@ -60,7 +60,7 @@ def test_a_robot_sees_the_frame_at_the_beginning_of_its_step(played):
             assert_seen(made, expected[t], t)
         clock[0] += 0.05 + 0.01 * (t % 3 - 1)  # small deviations do not matter
     assert made.over and made.held == 0
-    assert made.info == {name: value.item() for name, value in info.items()}
+    assert made.info == info
 
 
 def test_a_robot_holds_its_pose_where_no_action_comes(played):

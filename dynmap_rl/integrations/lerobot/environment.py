@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from functools import partial
 
 import gymnasium as gym
-import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
@@ -116,11 +115,10 @@ class DynmapEnvConfig(EnvConfig):
 
 
 class _ForLeRobot(gym.Wrapper):
-    """Adapter of resets and ``info`` to LeRobot.
+    """Adapter of resets to LeRobot.
 
     Seeds count within a split. The mark of a new rollout that LeRobot adds to the options of a reset is removed, since
-    options are factors of a scene of cart and block. ``info`` has plain values: a vector environment would store NumPy's booleans
-    as objects.
+    options are factors of a scene of cart and block.
     """
 
     def __init__(self, env: gym.Env, split: str):
@@ -130,19 +128,10 @@ class _ForLeRobot(gym.Wrapper):
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         seed = None if seed is None else scene_seed(self.split, seed)
         options = {name: value for name, value in (options or {}).items() if name != NEW_ROLLOUT_OPTION}
-        observation, info = self.env.reset(seed=seed, options=options)
-        return observation, _plain(info)
-
-    def step(self, action):
-        *result, info = self.env.step(action)
-        return *result, _plain(info)
-
-
-def _plain(info: dict) -> dict:
-    return {name: value.item() for name, value in info.items() if isinstance(value, np.generic)}
+        return self.env.reset(seed=seed, options=options)
 
 
 def make_env(gym_id: str, arguments: dict, split: str, delay: FrameDelay | None = None) -> gym.Env:
-    """Make a Gymnasium environment whose seeds and ``info`` are as LeRobot needs them."""
+    """Make a Gymnasium environment whose seeds are as LeRobot needs them."""
     env = gym.make(gym_id, disable_env_checker=True, **arguments)
     return _ForLeRobot(DelayFrames(env, delay) if delay else env, split)
