@@ -121,8 +121,11 @@ def load_world_models(runs: list[str]) -> dict:
         if world_model.architecture != "glimpse":
             row += f", {world_model.architecture}"
         models[row, run] = world_model
-    count = Counter(row for row, _ in models)
-    return {row if count[row] == 1 else f"{row}, {run}": model for (row, run), model in models.items()}
+    rows, names = Counter(row for row, _ in models), Counter(Path(run).name for _, run in models)
+    return {
+        row if rows[row] == 1 else f"{row}, {Path(run).name if names[Path(run).name] == 1 else run}": model
+        for (row, run), model in models.items()
+    }
 
 
 def describe(open_loop: dict, probes: dict, perception: dict, verdicts: dict, seconds: float) -> str:

@@ -79,7 +79,10 @@ def test_runs_of_one_row_are_named_by_their_folders(trained):
     none, again, position = (f"{trained / name}" for name in ("none", "again", "position"))
     models = load_world_models([none, again, f" {position}", f"{none}/"])
     row = "Only-RGB, decoupled"
-    assert list(models) == [f"{row}, {none}", f"{row}, {again}", "RGB+[P], decoupled"]
+    assert list(models) == [f"{row}, none", f"{row}, again", "RGB+[P], decoupled"]
+    shutil.copytree(trained / "none", trained / "other" / "none")
+    other = f"{trained / 'other' / 'none'}"
+    assert list(load_world_models([none, other])) == [f"{row}, {none}", f"{row}, {other}"]
 
 
 def test_a_dataset_of_another_task_is_refused(trained, recordings, tmp_path):
