@@ -18,7 +18,9 @@ import tempfile
 import time
 from pathlib import Path
 
+from dynmap_rl.utils.cli import command_line
 from dynmap_rl.utils.files import read_json, write_json
+from dynmap_rl.utils.version import find_commit
 
 RECIPES = Path(__file__).parents[2] / "recipes"
 RESULTS = RECIPES / "results/measurements/memory.json"
@@ -90,7 +92,8 @@ def main(names: list[str]) -> None:
                 peak([sys.executable, str(RECIPES / f"{name}.py"), *COMMANDS[name]], folder), 2
             )
         print(f"{name}: {found[name]} GB", flush=True)
-        write_json(RESULTS, {"unit": "GB", "peak": found})
+        facts = {"command": command_line(sys.argv), "commit": find_commit()}
+        write_json(RESULTS, {"unit": "GB", "peak": found} | facts)
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ slope one is linear cost.
 
 from __future__ import annotations
 
+import sys
 import tempfile
 from pathlib import Path
 
@@ -21,7 +22,9 @@ from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.evaluation.rollout import roll_out
 from dynmap_rl.modules.actor import Actor
 from dynmap_rl.modules.checkpoints import make_policy, make_world_model
+from dynmap_rl.utils.cli import command_line
 from dynmap_rl.utils.files import write_json
+from dynmap_rl.utils.version import find_commit
 
 RESULTS = Path(__file__).parents[2] / "recipes/results/measurements"
 FACTORS = 1, 10, 100
@@ -82,7 +85,10 @@ def main() -> None:
     found = measure()
     for name, pairs in found.items():
         print(name, ", ".join(f"{size}: {time:.3g} s" for size, time in pairs))
-    write_json(RESULTS / "scaling.json", found)
+    write_json(
+        RESULTS / "scaling.json",
+        {"seconds": found, "command": command_line(sys.argv), "commit": find_commit()},
+    )
     draw(found, RESULTS.with_name("media") / "scaling.png")
 
 

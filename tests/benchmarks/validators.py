@@ -13,10 +13,13 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 from dynmap_rl.envs.tasks import TASKS
+from dynmap_rl.utils.cli import command_line
 from dynmap_rl.utils.files import write_json
+from dynmap_rl.utils.version import find_commit
 
 RESULTS = Path(__file__).parents[2] / "recipes/results/measurements"
 COMMANDS = {
@@ -49,7 +52,9 @@ def main() -> None:
         found[task] = {name: validate(name, Path("datasets") / task) for name in COMMANDS}
         for name, result in found[task].items():
             print(f"{task}, {name}: exit {result['exit']}", *result["said"], sep="\n  ", flush=True)
-    write_json(RESULTS / "validators.json", found)
+    write_json(
+        RESULTS / "validators.json", found | {"command": command_line(sys.argv), "commit": find_commit()}
+    )
 
 
 if __name__ == "__main__":

@@ -27,6 +27,7 @@ import torch
 from safetensors.torch import load_file
 
 from dynmap_rl.utils.files import read_json, write_json
+from dynmap_rl.utils.version import find_commit
 
 TESTS = Path(__file__).parents[1]
 RECIPES, PRESETS = TESTS.parent / "recipes", TESTS / "presets"
@@ -134,7 +135,7 @@ def torment(recipe: str, kills: int, folder: Path) -> dict[str, int | str]:
             raise SystemExit(f"{recipe}: after {count} kills these differ: {', '.join(differing)}")
     counts = {"kills": count, "runs": runs, "after_a_saved_state": midway, "files_the_same": len(expected)}
     print(f"{recipe}: {counts}", flush=True)
-    return counts | {"arguments": COMMANDS[recipe].replace(f"{TESTS.parent}/", "")}
+    return counts | {"arguments": COMMANDS[recipe].replace(f"{TESTS.parent}/", ""), "commit": find_commit()}
 
 
 def main() -> None:

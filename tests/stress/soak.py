@@ -11,7 +11,6 @@ remains. The script fails where that is at the end more than 2 MB above its valu
 import argparse
 import ctypes
 import gc
-import json
 import resource
 import sys
 import time
@@ -21,6 +20,9 @@ import gymnasium
 import numpy as np
 
 import dynmap_rl  # noqa: F401 (the ids)
+from dynmap_rl.utils.cli import command_line
+from dynmap_rl.utils.files import write_json
+from dynmap_rl.utils.version import find_commit
 
 IDS = "dynmap_rl/BalanceReaching-v1", "dynmap_rl/BalanceReachingObstacle-v1", "dynmap_rl/BinDropping-v1"
 RESULTS = Path(__file__).parents[2] / "recipes/results/measurements/soak.json"
@@ -72,7 +74,7 @@ def main() -> None:
     began = time.perf_counter()
     result = soak(arguments.steps)
     if arguments.steps == 1_000_000:
-        RESULTS.write_text(json.dumps(result | {"command": "python tests/stress/soak.py"}, indent=1) + "\n")
+        write_json(RESULTS, result | {"command": command_line(sys.argv), "commit": find_commit()})
     print(f"{result['growth_mb']:+.1f} MB in {time.perf_counter() - began:.0f} s")
     if result["growth_mb"] > GROWTH_MB:
         sys.exit("the memory grows")
