@@ -70,6 +70,8 @@ class TaskEnv(gym.Env):
 
     def step(self, action: np.ndarray):
         task, space = self.task, self.action_space
+        if np.shape(action) != space.shape:
+            raise ValueError(f"an action must have the shape {space.shape}, got {np.shape(action)}")
         self.task.step([self.world], [np.clip(np.asarray(action, np.float32), space.low, space.high)])
         truncated = self.world.steps >= self._max_episode_steps
         reward = float(task.reward(self.world))

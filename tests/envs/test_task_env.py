@@ -51,3 +51,10 @@ def test_success_is_reported_in_the_last_step_alone(own_task):  # noqa: F811
 def test_options_that_would_have_no_effect_are_refused():
     with pytest.raises(ValueError, match="goal_x"):
         TaskEnv("balance_reaching").reset(seed=0, options={"goal_x": 0.7})
+
+
+def test_an_action_of_another_shape_is_refused():
+    env = TaskEnv("balance_reaching")
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"\(3,\), got \(2,\)"):
+        env.step(np.zeros(2, np.float32))
