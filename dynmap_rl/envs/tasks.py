@@ -254,7 +254,7 @@ def _make_task(name: str, from_file: bool) -> BaseTask:
         hint = "; MuJoCo tasks need pip install '.[mujoco]'" if own and isinstance(error, ImportError) else ""
         raise ValueError(f"the task must be module:Class, got {name!r} ({error}){hint}") from error
     if not (isinstance(task, type) and issubclass(task, BaseTask)):
-        raise ValueError(f"{name!r} must be a subclass of dynmap_rl.envs.Task, got {task!r}")
+        raise ValueError(f"{name!r} must be a subclass of dynmap_rl.envs.Task or BaseTask, got {task!r}")
     if missing := sorted(task.__abstractmethods__):
         raise ValueError(f"the task {name!r} must define {', '.join(missing)}")
     try:

@@ -102,7 +102,8 @@ def list_checkpoints(expert: str | Path) -> list[str]:
     names.sort(key=lambda name: (len(name), name))  # iteration_1000 after iteration_995
     if not names:
         raise ValueError(
-            f"no expert at {expert}; train one with recipes/expert.py and give its checkpoint folder"
+            f"no expert at {expert}; train one with recipes/expert.py and give its checkpoint folder, or give a task of "
+            "your own a demonstrator"
         )
     return names
 

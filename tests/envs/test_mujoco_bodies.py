@@ -72,3 +72,25 @@ def test_unknown_names_are_refused():
         BodyReader(mujoco.MjModel.from_xml_string(XML), [Body("cup")])
     with pytest.raises(ValueError, match="orientation"):
         Body("box", orientation="euler")
+
+
+def test_what_is_read_is_of_the_present_and_not_of_the_last_substep():
+    model = mujoco.MjModel.from_xml_string(XML)
+    data, present = mujoco.MjData(model), mujoco.MjData(model)
+    data.qvel[3:] = 2, 3, 1
+    reader = BodyReader(model, [Body("box"), Body("tip", orientation="axis"), Body("ball", "side", "none")])
+    mujoco.mj_step(model, data, nstep=20)
+    present.qpos, present.qvel = data.qpos, data.qvel
+    mujoco.mj_forward(model, present)
+    late = data.xpos.copy()
+    for found, expected in zip(reader.read(data), reader.read(present), strict=True):
+        np.testing.assert_array_equal(found, expected)
+    assert not np.array_equal(late, present.xpos)
+
+
+def test_mocap_bodies_are_refused():
+    xml = """<mujoco><worldbody><body name="hand" mocap="true"><geom name="palm" size="0.1"/>
+      <body name="tool"><geom size="0.1"/></body></body></worldbody></mujoco>"""
+    for name in ("hand", "palm", "tool"):
+        with pytest.raises(ValueError, match=f"{name} is on a mocap body"):
+            BodyReader(mujoco.MjModel.from_xml_string(xml), [Body(name)])

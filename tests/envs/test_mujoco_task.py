@@ -7,6 +7,7 @@ import torch
 from own_task import check_renderer, own_task, read_code  # noqa: F401
 from torchrl.envs.utils import check_env_specs
 
+from dynmap_rl.data.recording import plans
 from dynmap_rl.data.recording.plans import demonstrate, plan_demonstrations
 from dynmap_rl.envs.protocol import Layout
 from dynmap_rl.envs.tasks import get_task
@@ -134,6 +135,83 @@ def test_an_environment_that_does_not_fit_is_refused(own_task, monkeypatch):  # 
     monkeypatch.setattr(type(task), "is_solved", lambda self, world: True)
     with pytest.raises(ValueError, match="starts that are not solved"):
         task.begin(0)
+
+
+def test_a_reset_may_replace_the_model(own_task, monkeypatch):  # noqa: F811
+    task = get_task(own_task)
+    draw, world = task.make_renderer(), task.begin(3)
+    expected = draw(world), world.position.copy()
+    reset = type(task).reset
+
+    def replace(self, env, seed):
+        env.__init__()
+        return reset(self, env, seed)
+
+    monkeypatch.setattr(type(task), "reset", replace)
+    world = task.begin(3, None, world)
+    assert world.data is world.env.data and (draw(world) == expected[0]).all()
+    task.step([world], [np.ones(1)])
+    assert not np.array_equal(world.position, expected[1]) and (draw(world) != expected[0]).any()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("fps", 10, "fps must be 20"),
+        ("goal", lambda self, world: np.zeros(2), r"\[3\], got \[2\]"),
+        ("make", lambda self: gymnasium.make("CartPole-v1"), "must have MuJoCo's model"),
+    ],
+)
+def test_mistakes_of_a_task_are_named(own_task, monkeypatch, name, value, message):  # noqa: F811
+    task = get_task(own_task)
+    monkeypatch.setattr(type(task), name, value)
+    with pytest.raises(ValueError, match=message):
+        task.step([task.begin(0)], [np.ones(1)])
+
+
+def test_steps_that_say_nothing_of_success_and_unstable_ones_are_refused(own_task, monkeypatch):  # noqa: F811
+    task = get_task(own_task)
+    world = task.begin(0)
+    with pytest.raises(ValueError, match="1 finite numbers"):
+        task.step([world], [np.ones(2)])
+    step = type(world.env).step
+    monkeypatch.setattr(type(world.env), "step", lambda self, action: (*step(self, action)[:4], {}))
+    with pytest.raises(ValueError, match="override is_solved"):
+        task.step([world], [np.ones(1)])
+    world.data.qpos[:] = np.nan
+    monkeypatch.setattr(type(world.env), "step", lambda self, action: (0, 0, False, False, {}))
+    with pytest.raises(ValueError, match="not finite"):
+        task.step([world], [np.ones(1)])
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("bodies", lambda old: (old[0], old[0]), "different names"),
+        ("bodies", lambda old: old[0], "tuple of Body"),
+        ("views", lambda old: ("front",), "tuple of Camera"),
+        ("views", lambda old: (), "tuple of Camera"),
+    ],
+)
+def test_bodies_and_views_are_checked(own_task, monkeypatch, name, value, message):  # noqa: F811
+    kind = type(get_task(own_task))
+    monkeypatch.setattr(kind, name, value(getattr(kind, name)))
+    with pytest.raises(ValueError, match=message):
+        kind()
+
+
+def test_a_seed_must_determine_the_start_of_a_recording(own_task, monkeypatch):  # noqa: F811
+    kind, counter = type(get_task(own_task)), iter(range(100))
+    monkeypatch.setattr(kind, "reset", lambda self, env, seed: env.reset(seed=next(counter)))
+    with pytest.raises(ValueError, match="a seed must determine the start"):
+        plans._open_simulator.__wrapped__(own_task, kind)
+
+
+def test_a_demonstrator_returns_all_entries(own_task, monkeypatch):  # noqa: F811
+    kind = type(get_task(own_task))
+    monkeypatch.setattr(kind, "demonstrator", lambda self, world: lambda: np.zeros(3))
+    with pytest.raises(ValueError, match=r"1 entries, got the shape \(3,\)"):
+        demonstrate(own_task, plan_demonstrations(own_task, "train", 0, 1))
 
 
 @pytest.mark.slow

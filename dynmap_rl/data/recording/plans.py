@@ -190,9 +190,20 @@ def demonstrate(task: str, plans: list[Plan]) -> TensorDict:
 
 @lru_cache(1)
 def _open_simulator(task: str, kind: type) -> tuple[Callable, SimulatedWorld]:
-    """Return a renderer and a world, which the next recordings of a task use again; loading takes up to a second."""
+    """Return a renderer and a world, which the next recordings of a task use again; loading takes up to a second.
+
+    Raises:
+        ValueError: the scene's seed does not determine the start.
+    """
     rules = get_task(task)
-    return rules.make_renderer(), rules.begin(0)
+    world = rules.begin(0)
+    first = np.concatenate([world.position, rules.agent_pos(world)])
+    world = rules.begin(0, None, world)
+    if not np.allclose(first, np.concatenate([world.position, rules.agent_pos(world)]), atol=1e-6):
+        raise ValueError(
+            f"a seed must determine the start of {task}, but two resets with one seed differ; use the seed in its reset"
+        )
+    return rules.make_renderer(), world
 
 
 def _demonstrate(rules: BaseTask, draw: Callable, world: SimulatedWorld, plan: Plan) -> Iterator[dict]:
@@ -204,6 +215,10 @@ def _demonstrate(rules: BaseTask, draw: Callable, world: SimulatedWorld, plan: P
         row = {"pixels": draw(world), "agent_pos": agent_pos, "goal": agent_pos[-layout.goal_size :]}
         row |= {f"dynamics.{name}": getattr(world, name).astype(np.float32) for name in DYNAMICS}
         action = np.asarray(expert(), np.float32)
+        if action.shape != limit.shape:
+            raise ValueError(
+                f"the demonstrator of {rules.name} must return {len(limit)} entries, got the shape {action.shape}"
+            )
         noise = plan.noise * rng.standard_normal(len(limit)).astype(np.float32) * limit
         noise = noise * (not getattr(expert, "exact", False))
         row |= {"action": (action + noise).clip(-limit, limit), "expert_action": action.clip(-limit, limit)}

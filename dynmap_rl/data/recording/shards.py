@@ -142,7 +142,9 @@ def _roll_out_shard(shard: Shard) -> tuple[list[Plan], TensorDict]:
         size = missing if shard.kind == "exploration" or one_by_one else missing + missing // 8 + 2
         if start + size > CANDIDATES_PER_SHARD:
             better = (
-                "improve its demonstrator" if one_by_one else "train a better expert with recipes/expert.py"
+                "improve its demonstrator, or its success condition"
+                if one_by_one
+                else "train a better expert with recipes/expert.py"
             )
             raise ValueError(
                 f"{shard.count} of {start} candidates of {shard.task} must succeed, got {len(plans)}; {better}"

@@ -1,6 +1,8 @@
 from .bodies import Body as Body
 from .fetch import FetchPush as FetchPush
 from .fetch import FetchSlide as FetchSlide
+from .fetch import FetchTask as FetchTask
+from .meta_world import MetaWorldTask as MetaWorldTask
 from .meta_world import PlateSlide as PlateSlide
 from .meta_world import Soccer as Soccer
 from .rendering import Camera as Camera

@@ -61,16 +61,27 @@ class BodyReader:
         bodies: what to read, in this order.
 
     Raises:
-        ValueError: the model has no body, geom or site of a name.
+        ValueError: the model has no body, geom or site of a name, or it is on a mocap body, which has no velocity.
     """
 
     def __init__(self, model: mujoco.MjModel, bodies: Sequence[Body]):
         self.model = model
         self.bodies = [(body.orientation, *_find(model, body.place or body.name)) for body in bodies]
+        for body, (_, kind, number) in zip(bodies, self.bodies, strict=True):
+            if model.body_mocapid[model.body_rootid[BODIES[kind](model, number)]] >= 0:
+                raise ValueError(
+                    f"{body.name} is on a mocap body, whose velocity MuJoCo does not know; name the body that is welded "
+                    "to it"
+                )
         self.six = np.empty(6)
 
     def read(self, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
-        """Return the positions ``[P]`` and velocities ``[V]`` of all bodies, float64 in SI units."""
+        """Return the positions ``[P]`` and velocities ``[V]`` of all bodies, float64 in SI units.
+
+        Poses are brought up to date first: after ``mj_step`` they are those before its last substep.
+        """
+        for update in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_comVel):
+            update(self.model, data)
         position, velocity = [], []
         for orientation, kind, number in self.bodies:
             point, matrix = POSES[kind](data, number)
@@ -91,6 +102,12 @@ POSES = {  # XBODY is a body's own frame; BODY would be the frame of its centre 
     mujoco.mjtObj.mjOBJ_XBODY: lambda data, i: (data.xpos[i], data.xmat[i]),
     mujoco.mjtObj.mjOBJ_GEOM: lambda data, i: (data.geom_xpos[i], data.geom_xmat[i]),
     mujoco.mjtObj.mjOBJ_SITE: lambda data, i: (data.site_xpos[i], data.site_xmat[i]),
+}
+
+BODIES = {  # number of the body that each is on
+    mujoco.mjtObj.mjOBJ_XBODY: lambda model, i: i,
+    mujoco.mjtObj.mjOBJ_GEOM: lambda model, i: model.geom_bodyid[i],
+    mujoco.mjtObj.mjOBJ_SITE: lambda model, i: model.site_bodyid[i],
 }
 
 

@@ -33,13 +33,24 @@ class MujocoWorld:
         info: last ``info`` of the environment.
         reward: last reward.
         solved: whether any step so far was a success.
+
+    Raises:
+        ValueError: the environment has no MuJoCo model, or lacks one of the bodies.
     """
 
     def __init__(self, env: gymnasium.Env, bodies: Sequence[Body], dt: float):
-        self.env, self.dt = env, dt
-        self.model, self.data = env.unwrapped.model, env.unwrapped.data
-        self.reader = BodyReader(self.model, bodies)
-        self.renderer: FrameRenderer | None = None
+        self.env, self.bodies, self.dt, self.model, self.data = env, bodies, dt, None, None
+        if not (hasattr(env.unwrapped, "model") and hasattr(env.unwrapped, "data")):
+            raise ValueError(f"{env.unwrapped!r} must have MuJoCo's model and data")
+        self.attach()
+
+    def attach(self) -> None:
+        """Read and draw the environment's present model and data, which a reset may have replaced."""
+        inner = self.env.unwrapped
+        if inner.model is not self.model or inner.data is not self.data:
+            self.model, self.data = inner.model, inner.data
+            self.reader = BodyReader(self.model, self.bodies)
+            self.renderer: FrameRenderer | None = None
 
     def begin(self, observation: Any, info: dict) -> None:
         """Forget the last episode, after a reset of the environment."""
@@ -49,10 +60,19 @@ class MujocoWorld:
         self.acceleration = np.zeros_like(self.velocity)
 
     def step(self, action: np.ndarray) -> None:
-        """Simulate one control step."""
+        """Simulate one control step.
+
+        Raises:
+            ValueError: the step does not last ``dt``, or the simulation is unstable.
+        """
+        time, before = self.data.time, self.velocity
         self.observation, reward, _, _, self.info = self.env.step(action)
-        self.reward, self.steps, before = float(reward), self.steps + 1, self.velocity
+        self.reward, self.steps = float(reward), self.steps + 1
+        if self.steps == 1 and not np.isclose(elapsed := self.data.time - time, self.dt):
+            raise ValueError(f"fps must be {1 / elapsed:g}, the environment's, got {1 / self.dt:g}")
         self.position, self.velocity = self.reader.read(self.data)
+        if not (np.isfinite(self.position).all() and np.isfinite(self.velocity).all()):
+            raise ValueError(f"positions are not finite after {self.steps} steps: the simulation is unstable")
         # MuJoCo's own accelerations are those of an instant, with spikes at contacts.
         self.acceleration = (self.velocity - before) / self.dt
 
@@ -63,7 +83,7 @@ class MujocoTask(BaseTask):
     A subclass must define ``name``, ``description``, ``bodies``, ``views``, ``steps``, ``fps``, ``make`` and ``goal``.
     The environment may be any whose ``unwrapped`` has ``model`` and ``data`` and whose actions are a box that is
     symmetric about 0. Success is ``info["is_success"]`` or ``info["success"]`` after a step; override :meth:`is_solved`
-    where ``reset`` does not return it and a start may be solved already.
+    where ``info`` has neither, or where ``reset`` does not return it and a start may be solved already.
 
     Args:
         image_size: side of a frame in pixels: 64, 96 or 128.
@@ -99,6 +119,12 @@ class MujocoTask(BaseTask):
     max_worlds = 16
 
     def __init__(self, image_size: int = 64, cameras: int = 1, arm: bool = False):
+        for name, kind in (("bodies", Body), ("views", Camera)):
+            values = getattr(self, name)
+            if not (isinstance(values, tuple) and values and all(isinstance(some, kind) for some in values)):
+                raise ValueError(f"{name} must be a tuple of {kind.__name__}, got {values!r}")
+            if len({some.name for some in values}) < len(values):
+                raise ValueError(f"{name} must have different names, got {[some.name for some in values]}")
         if image_size not in SIZES:
             raise ValueError(f"image_size must be one of {SIZES}, got {image_size}")
         if not 1 <= cameras <= len(self.views):
@@ -122,8 +148,15 @@ class MujocoTask(BaseTask):
         mujoco.mj_forward(world.model, world.data)
 
     def is_solved(self, world: MujocoWorld) -> bool:
-        """Return whether the goal is reached now."""
-        return bool(world.info.get("is_success", world.info.get("success", False)))
+        """Return whether the goal is reached now.
+
+        Raises:
+            ValueError: the environment's ``info`` does not say so after a step.
+        """
+        found = world.info.get("is_success", world.info.get("success"))
+        if found is None and world.steps:
+            raise ValueError(f"info of {self.name} must have is_success or success; or override is_solved")
+        return bool(found)
 
     def is_dropped(self, world: MujocoWorld) -> bool:
         """Return whether the object is lost."""
@@ -163,8 +196,11 @@ class MujocoTask(BaseTask):
         world = world or self._make_world()
         observation, info = self.reset(world.env, seed)
         for _ in range(ATTEMPTS):
+            world.attach()
             self.prepare(world)
             world.begin(observation, info)
+            if (shape := np.shape(self.goal(world))) != (3,):
+                raise ValueError(f"goal of {self.name} must return x, y and z, [3], got {list(shape)}")
             world.position_error = self.distance(world)
             if not self.is_solved(world):
                 return world
@@ -179,17 +215,14 @@ class MujocoTask(BaseTask):
             raise ValueError(
                 f"{self.name} must have actions of {size} entries within {self.action_limit}, got {env.action_space}"
             )
-        dt = getattr(env.unwrapped, "dt", 1 / self.fps)
-        if not np.isclose(dt * self.fps, 1):
-            raise ValueError(f"fps of {self.name} must be {1 / dt:g}, the environment's, got {self.fps}")
         return world
 
     def step(self, worlds: Sequence[MujocoWorld], actions: Sequence[np.ndarray]) -> None:
         """Simulate one control step of every world with its action ``[A]``, cut to the limits."""
         for world, action in zip(worlds, actions, strict=True):
             action = np.asarray(action, dtype=np.float32)
-            if not np.isfinite(action).all():
-                raise ValueError(f"an action must be finite numbers, got {action}")
+            if action.shape != (len(self.action),) or not np.isfinite(action).all():
+                raise ValueError(f"an action must be {len(self.action)} finite numbers, got {action}")
             world.step(action.clip(-self.action_limit, self.action_limit))
             world.position_error = self.distance(world)
             world.solved |= self.is_solved(world)
