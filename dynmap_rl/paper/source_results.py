@@ -238,20 +238,22 @@ def plot_data(results: Path, task: str, path: Path) -> None:
 def plot_measures(results: Path, task: str, path: Path) -> None:
     """Draw SR against each cheap measure, a colour for each source, with the rank correlation."""
     correlations = rank_correlations(results, task)
-    figure, axes = plt.subplots(1, len(MEASURES), figsize=(11, 3.8), sharey=True, layout="constrained")
+    figure, axes = plt.subplots(1, len(MEASURES), figsize=(11, 4.6), sharey=True, layout="constrained")
     colors = dict(zip(SOURCES, plt.get_cmap("tab20").colors, strict=False))
     for axis, (measure, (text, _)) in zip(axes, MEASURES.items(), strict=True):
         title = []
         for policy, marker in zip(POLICIES, "os", strict=True):
             for x, y, name in zip(*measured_points(results, task, policy, measure), strict=True):
-                label = f"{SOURCES[name].text}, {policy}"
-                axis.plot(x, y, marker, ms=6, color=colors[name], label=label)
+                named = any(line.get_label() == SOURCES[name].text for line in axis.lines)
+                axis.plot(x, y, marker, ms=6, color=colors[name], label=None if named else SOURCES[name].text)
             if found := correlations.get(f"{policy}, {measure}"):
-                title.append(f"{policy}: rank correlation {found['rho']:.2f}")
+                shape = {"o": "circles", "s": "squares"}[marker]
+                title.append(f"{policy} ({shape}): rank correlation {found['rho']:.2f}")
         axis.set_title("\n".join(title), fontsize=8)
         axis.set_xlabel(text, fontsize=8)
         axis.grid(alpha=0.3)
     axes[0].set_ylabel("success [%]", fontsize=8)
     if axes[-1].lines:
-        axes[-1].legend(fontsize=7, loc="center left", bbox_to_anchor=(1.02, 0.5))
+        handles, labels = axes[-1].get_legend_handles_labels()
+        figure.legend(handles, labels, fontsize=7, loc="outside lower center", ncols=4)
     save_figure(figure, path)
