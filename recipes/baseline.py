@@ -2,8 +2,7 @@
 
     python recipes/baseline.py --task mujoco:PlateSlide                        # ACT
     python recipes/baseline.py --task mujoco:PlateSlide --policy diffusion
-
-    python recipes/baseline.py --full_size --steps 100000 --batch 8            # LeRobot's defaults, for a GPU
+    python recipes/baseline.py --full_size --steps 100000 --batch 8            # LeRobot's sizes, for a GPU
 
 Needs pip install '.[lerobot]'. The policies read frames and observation.state, which holds the goal. They are smaller than
 LeRobot's defaults, for two cores, and all weights begin at random. The same command resumes a stopped run at LeRobot's

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import product
 
 from dynmap_rl.evaluation.statistics import paired_interval, rate_gap, welch_interval
 
@@ -147,10 +148,9 @@ def gap_over_trainings(a: Cell, b: Cell, outcome: str = "success") -> tuple[floa
     of a row; otherwise Welch's.
     """
     rates_a, rates_b = a.rates(outcome), b.rates(outcome)
-    if shared := [name for name in a.fingerprints if name in b.fingerprints]:
-        paired_a = [rates_a[a.fingerprints.index(name)] for name in shared]
-        paired_b = [rates_b[b.fingerprints.index(name)] for name in shared]
-        return paired_interval(paired_a, paired_b)
+    pairs = product(zip(a.fingerprints, rates_a, strict=False), zip(b.fingerprints, rates_b, strict=False))
+    if shared := [(ours, theirs) for (name, ours), (other, theirs) in pairs if name == other]:
+        return paired_interval(*zip(*shared, strict=True))
     return welch_interval(rates_a, rates_b)
 
 
