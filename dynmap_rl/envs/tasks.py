@@ -252,14 +252,16 @@ def _make_task(name: str, from_file: bool) -> BaseTask:
         task = getattr(importlib.import_module(MUJOCO_MODULE if own else module), attribute)
     except (ImportError, AttributeError) as error:
         hint = "; MuJoCo tasks need pip install '.[mujoco]'" if own and isinstance(error, ImportError) else ""
-        raise ValueError(f"the task must be module:Class, got {name!r} ({error}){hint}") from error
+        raise ValueError(
+            f"the task must be module:Class or module:Class:argument=value, got {name!r} ({error}){hint}"
+        ) from error
     if not (isinstance(task, type) and issubclass(task, BaseTask)):
         raise ValueError(f"{name!r} must be a subclass of dynmap_rl.envs.Task or BaseTask, got {task!r}")
     if missing := sorted(task.__abstractmethods__):
         raise ValueError(f"the task {name!r} must define {', '.join(missing)}")
     try:
         made = task(**_parse_arguments(rest[0] if rest else ""))
-    except (TypeError, ValueError, SyntaxError) as error:
+    except (TypeError, ValueError) as error:
         raise ValueError(f"the arguments of the task {name!r} are wrong ({error})") from error
     if rest:
         made.name = re.sub("[^a-z0-9]+", "_", f"{made.name}_{rest[0].lower()}")
@@ -267,6 +269,13 @@ def _make_task(name: str, from_file: bool) -> BaseTask:
 
 
 def _parse_arguments(text: str) -> dict[str, object]:
-    """Parse ``"image_size=96,arm=True"``."""
+    """Parse ``"image_size=96,arm=True"``; a value that is no literal of Python is a text."""
     pairs = (part.partition("=")[::2] for part in text.split(",") if part)
-    return {name.strip(): ast.literal_eval(value.strip()) for name, value in pairs}
+    return {name.strip(): _parse_value(value.strip()) for name, value in pairs}
+
+
+def _parse_value(text: str) -> object:
+    try:
+        return ast.literal_eval(text)
+    except (ValueError, SyntaxError):
+        return text

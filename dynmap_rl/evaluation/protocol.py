@@ -74,7 +74,7 @@ def _judge_batches(actor: TensorDictModuleBase, run: partial, seeds: list[int], 
     # A task that limits its worlds divides the batches, and needs long to make new worlds.
     size = BATCH if get_task(run.keywords["task"]).max_worlds is None else 2 * BATCH
     batches = [seeds[start : start + size] for start in range(0, len(seeds), size)]
-    judge, title = partial(_judge_batch, lambda: actor, run), f"{len(seeds)} episodes"
+    judge, title = partial(_judge_batch, lambda: actor, run), f"batches of {size} episodes"
     if min(workers, len(batches)) <= 1:
         return list(chain.from_iterable(map_processes(judge, batches, 1, title)))
     judge, threads = partial(_judge_batch, partial(_load_actor, _pickle(actor)), run), torch.get_num_threads()

@@ -105,7 +105,8 @@ def test_arguments_are_a_part_of_the_name(own_task):  # noqa: F811
         ("image_size=65", "image_size must be one of"),
         ("cameras=3", "cameras must be 1 to 2"),
         ("color=1", "arguments of the task"),
-        ("image_size=__import__('os')", "arguments of the task"),
+        ("image_size=__import__('os')", "image_size must be one of"),
+        ("cameras=front", "cameras must be 1 to 2"),
     ],
 )
 def test_wrong_arguments_are_refused(own_task, arguments, message):  # noqa: F811
@@ -207,10 +208,13 @@ def test_a_seed_must_determine_the_start_of_a_recording(own_task, monkeypatch): 
         plans._open_simulator.__wrapped__(own_task, kind)
 
 
-def test_a_demonstrator_returns_all_entries(own_task, monkeypatch):  # noqa: F811
-    kind = type(get_task(own_task))
-    monkeypatch.setattr(kind, "demonstrator", lambda self, world: lambda: np.zeros(3))
-    with pytest.raises(ValueError, match=r"1 entries, got the shape \(3,\)"):
+@pytest.mark.parametrize(
+    ("expert", "message"),
+    [(lambda: np.zeros(3), r"1 entries, got the shape \(3,\)"), (None, "must return a function")],
+)
+def test_a_demonstrator_returns_all_entries(own_task, monkeypatch, expert, message):  # noqa: F811
+    monkeypatch.setattr(type(get_task(own_task)), "demonstrator", lambda self, world: expert)
+    with pytest.raises(ValueError, match=message):
         demonstrate(own_task, plan_demonstrations(own_task, "train", 0, 1))
 
 

@@ -210,6 +210,8 @@ def _demonstrate(rules: BaseTask, draw: Callable, world: SimulatedWorld, plan: P
     """Yield the steps of an episode as arrays; TensorDicts would take longer than the simulator."""
     rng, expert, layout = np.random.default_rng([plan.scene_seed, 1]), rules.demonstrator(world), rules.layout
     limit = np.array(layout.action_limit, np.float32)
+    if not callable(expert):
+        raise ValueError(f"the demonstrator of {rules.name} must return a function, got {expert!r}")
     for t in range(layout.steps):
         agent_pos = np.asarray(rules.agent_pos(world), np.float32)
         row = {"pixels": draw(world), "agent_pos": agent_pos, "goal": agent_pos[-layout.goal_size :]}

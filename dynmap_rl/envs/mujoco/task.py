@@ -127,8 +127,8 @@ class MujocoTask(BaseTask):
                 raise ValueError(f"{name} must have different names, got {[some.name for some in values]}")
         if image_size not in SIZES:
             raise ValueError(f"image_size must be one of {SIZES}, got {image_size}")
-        if not 1 <= cameras <= len(self.views):
-            raise ValueError(f"cameras must be 1 to {len(self.views)}, got {cameras}")
+        if cameras not in range(1, len(self.views) + 1):
+            raise ValueError(f"cameras must be 1 to {len(self.views)}, got {cameras!r}")
         self.image_size, self.cameras, self.arm = image_size, self.views[:cameras], arm
 
     @abstractmethod
