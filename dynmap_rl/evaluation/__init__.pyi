@@ -10,7 +10,7 @@ from .protocol import judge_in_closed_loop as judge_in_closed_loop
 from .rollout import episode_rows as episode_rows
 from .rollout import roll_out as roll_out
 from .settings import Evaluation as Evaluation
-from .statistics import rate_gap as rate_gap
+from .statistics import outcome_gap as outcome_gap
 from .statistics import shared_interval as shared_interval
 from .statistics import student_interval as student_interval
 from .statistics import summarize as summarize

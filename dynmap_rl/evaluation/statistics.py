@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections import Counter
 from collections.abc import Sequence
@@ -155,43 +156,49 @@ def paired_interval(rates_a: Sequence[float], rates_b: Sequence[float]) -> tuple
     return float(found.low), float(found.high)
 
 
-def rate_gap(rows_a: list[list[dict]], rows_b: list[list[dict]], outcome: str = "success") -> dict:
-    """Compare the rates of two results on the same start states.
+def outcome_gap(terms: Sequence[tuple[int, list[list[dict]]]], outcome: str = "success") -> dict:
+    """Compare the mean outcomes of results on the same start states.
 
     Args:
-        rows_a: rows of the same scenes in the same order for every policy seed.
-        rows_b: likewise; its rate is subtracted.
-        outcome: entry of the rows that is counted.
+        terms: sign, 1 or -1, and rows of each result: for every policy seed those of the same scenes in the same order.
+            Two terms with 1 and -1 are the difference of two results.
+        outcome: entry of the rows: a flag, or ``position_error``.
 
     Returns:
-        ``gap`` in percentage points, its 95 % bootstrap ``interval`` over the start states, after averaging over policy
-        seeds, and ``p``, the two-sided probability of a gap of this size if the two were exchanged at random in every
-        start state.
+        ``gap``, the sum of the means with their signs, in percentage points or mm; its 95 % ``interval`` over the start
+        states, after averaging over policy seeds; and ``p``, the two-sided probability of a gap of this size if none is
+        to be expected. Those of flags are by bootstrap, and exact over exchanges of the sign in every start state;
+        those of ``position_error`` are by a t test.
 
     Raises:
-        ValueError: the two were not evaluated on the same scenes.
+        ValueError: the results are not on the same scenes.
     """
-    from scipy.stats import bootstrap
+    from scipy.stats import bootstrap, ttest_1samp
 
-    scenes = [[row["scene_seed"] for row in rows] for rows in (*rows_a, *rows_b)]
+    scenes = [[row["scene_seed"] for row in rows] for _, policies in terms for rows in policies]
     if any(s != scenes[0] for s in scenes):
         raise ValueError(
-            "both results must be on the same start states, got different scenes; evaluate both again"
+            "results must be on the same start states, got different scenes; evaluate them again"
         )
-
-    def count(rows, weight):  # whole numbers, so that a tie is one
-        return weight * np.sum([[row[outcome] for row in seed] for seed in rows], axis=0)
-
-    counts = count(rows_a, len(rows_b)) - count(rows_b, len(rows_a))
-    difference = 100 * counts / (len(rows_a) * len(rows_b))
+    flags = isinstance(terms[0][1][0][0][outcome], bool)
+    unit = math.lcm(
+        *(len(policies) for _, policies in terms)
+    )  # sums of flags are whole numbers, so that a tie is one
+    sums = sum(
+        sign * (unit // len(policies)) * np.sum([[row[outcome] for row in rows] for rows in policies], axis=0)
+        for sign, policies in terms
+    )
+    difference = (100 if flags else 1000) * sums / unit
     gap = float(difference.mean())
-    interval = gap, gap  # of equal differences
-    if np.ptp(difference):
-        found = bootstrap(
-            (difference,), np.mean, batch=1000, rng=np.random.default_rng(0)
-        ).confidence_interval
-        interval = float(found.low), float(found.high)
-    return {"gap": gap, "interval": interval, "p": exchange_p(counts)}
+    if not np.ptp(difference):
+        return {"gap": gap, "interval": (gap, gap), "p": exchange_p(sums) if flags else float(not gap)}
+    if flags:
+        rng, p = np.random.default_rng(0), exchange_p(sums)
+        interval = bootstrap((difference,), np.mean, batch=1000, rng=rng).confidence_interval
+    else:
+        test = ttest_1samp(difference, 0)
+        interval, p = test.confidence_interval(), float(test.pvalue)
+    return {"gap": gap, "interval": (float(interval.low), float(interval.high)), "p": p}
 
 
 def exchange_p(differences: np.ndarray) -> float:

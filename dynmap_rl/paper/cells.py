@@ -97,7 +97,7 @@ def list_runs() -> list[Run]:
     runs = [*_decoupled(0), *main, *_transfer(main, 0)]
     for seed in SEEDS[1:]:
         runs += [*_decoupled(seed), *_transfer(main, seed)]
-    runs += [run for seed in SEEDS for s in SUPERVISIONS[:2] for run in _plain(s, seed)]
+    runs += [run for seed in SEEDS for s in SUPERVISIONS[:5] for run in _plain(s, seed)]
     runs += [_ablate(row, seed, task) for seed in SEEDS for task in TASKS[:2] for row in ABLATIONS]
     return runs + other + [run for seed in SEEDS for run in _transfer(other, seed)]
 

@@ -70,9 +70,10 @@ class Cell:
         return [found for result in self.results if (found := result.get("world_model_sha256"))]
 
     def rates(self, outcome: str = "success") -> list[float]:
-        """Return the rate of an outcome for each world model, over its policies (%)."""
+        """Return the mean of an outcome for each world model, over its policies (%, or mm of ``position_error``)."""
+        scale = 1000 if outcome == "position_error" else 100
         return [
-            100 * float(np.mean([[row[outcome] for row in rows] for rows in policies]))
+            scale * float(np.mean([[row[outcome] for row in rows] for rows in policies]))
             for policies in self.world_models
         ]
 

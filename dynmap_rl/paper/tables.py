@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 
 from dynmap_rl.evaluation.failures import CAUSES
-from dynmap_rl.evaluation.statistics import rate_gap, summarize
+from dynmap_rl.evaluation.statistics import outcome_gap, summarize
 
 from .cells import TASKS, Key
 from .published import METRICS, TABLES
@@ -180,7 +180,7 @@ def _difference(cell: Cell, default: Cell | None) -> str:
         return ""
     if default is None or not (cell.results and default.results):
         return "-"
-    found = rate_gap(cell.policies, default.policies)
+    found = outcome_gap([(1, cell.policies), (-1, default.policies)])
     return f"{found['gap']:+.1f} {_brackets(found['interval'])}"
 
 

@@ -6,8 +6,8 @@ from scipy.stats import permutation_test, t, ttest_1samp, ttest_rel
 
 from dynmap_rl.evaluation.statistics import (
     exchange_p,
+    outcome_gap,
     paired_interval,
-    rate_gap,
     shared_interval,
     student_interval,
     summarize,
@@ -15,6 +15,10 @@ from dynmap_rl.evaluation.statistics import (
     welch_interval,
     wilson,
 )
+
+
+def gap_of(a, b, outcome="success"):
+    return outcome_gap([(1, a), (-1, b)], outcome)
 
 
 def rows(successes, dropped=0, count=10, error=0.02):
@@ -107,30 +111,30 @@ def test_paper_s_protocol_is_mean_and_standard_deviation_over_seeds():
 
 
 def test_gap_is_paired_and_has_an_interval():
-    result = rate_gap([rows(80, count=100)], [rows(60, count=100)])
+    result = gap_of([rows(80, count=100)], [rows(60, count=100)])
     assert result["gap"] == pytest.approx(20.0)
     assert result["interval"][0] < 20 < result["interval"][1]
-    same = rate_gap([rows(5)], [rows(5)])
+    same = gap_of([rows(5)], [rows(5)])
     assert same == {"gap": 0.0, "interval": (0.0, 0.0), "p": 1.0}
 
 
 def test_gap_does_not_depend_on_how_often_a_seed_counts():
     a, b = rows(6), rows(0)
-    assert rate_gap([a, a], [b])["gap"] == rate_gap([a], [b, b, b])["gap"] == pytest.approx(60.0)
+    assert gap_of([a, a], [b])["gap"] == gap_of([a], [b, b, b])["gap"] == pytest.approx(60.0)
 
 
 def test_p_is_that_of_a_sign_test_where_each_start_state_has_one_outcome():
     """5 starts that only a solves against 1 that only b solves: 2 * (1 + 6) / 2**6 by hand."""
     a = [dict(row, success=i < 5) for i, row in enumerate(rows(10))]
     b = [dict(row, success=i == 5) for i, row in enumerate(rows(10))]
-    assert rate_gap([a], [b])["p"] == pytest.approx(14 / 64)
-    assert rate_gap([b], [a])["p"] == pytest.approx(14 / 64)
+    assert gap_of([a], [b])["p"] == pytest.approx(14 / 64)
+    assert gap_of([b], [a])["p"] == pytest.approx(14 / 64)
 
 
 @pytest.mark.parametrize(("count", "p"), [(1, 1.0), (3, 0.25), (6, 1 / 32)])
 def test_p_where_all_start_states_agree(count, p):
     """a always succeeds, b never: 2 / 2**count by hand."""
-    result = rate_gap([rows(count, count=count)], [rows(0, count=count)])
+    result = gap_of([rows(count, count=count)], [rows(0, count=count)])
     assert result == {"gap": 100.0, "interval": (100.0, 100.0), "p": pytest.approx(p)}
 
 
@@ -138,8 +142,8 @@ def test_p_does_not_depend_on_rounding():
     """One of three policies fails in three starts of 1,000, where the others always succeed: 2 / 2**3 by hand."""
     a = [rows(1000, count=1000), rows(1000, count=1000), rows(997, count=1000)]
     b = [rows(1000, count=1000)] * 3
-    assert rate_gap(a, b)["p"] == pytest.approx(0.25)
-    assert rate_gap(b, a[2:])["p"] == pytest.approx(0.25)
+    assert gap_of(a, b)["p"] == pytest.approx(0.25)
+    assert gap_of(b, a[2:])["p"] == pytest.approx(0.25)
 
 
 def test_p_is_that_of_scipy_s_permutation_test():
@@ -154,7 +158,7 @@ def test_p_is_that_of_scipy_s_permutation_test():
 
 def test_gap_of_drops():
     a, b = rows(10), [dict(row, dropped=i < 3) for i, row in enumerate(rows(10))]
-    assert rate_gap([b], [a], "dropped")["gap"] == pytest.approx(
+    assert gap_of([b], [a], "dropped")["gap"] == pytest.approx(
         30.0 - 100 * np.mean([r["dropped"] for r in a])
     )
 
@@ -162,4 +166,23 @@ def test_gap_of_drops():
 def test_gap_refuses_other_start_states():
     other = [dict(row, scene_seed=row["scene_seed"] + 1) for row in rows(5)]
     with pytest.raises(ValueError, match="start states"):
-        rate_gap([rows(5)], [other])
+        gap_of([rows(5)], [other])
+
+
+def test_gap_of_position_errors_is_in_mm_and_of_a_paired_t_test():
+    errors = np.random.default_rng(0).normal(0.05, 0.01, (2, 30))
+    a, b = (
+        [dict(row, position_error=e) for row, e in zip(rows(5, count=30), one, strict=True)] for one in errors
+    )
+    expected = ttest_rel(*errors)
+    found = gap_of([a], [b], "position_error")
+    assert found["gap"] == pytest.approx(1000 * (errors[0] - errors[1]).mean())
+    assert found["p"] == pytest.approx(expected.pvalue)
+    assert found["interval"] == pytest.approx([1000 * end for end in expected.confidence_interval()])
+    assert gap_of([a], [a], "position_error") == {"gap": 0.0, "interval": (0.0, 0.0), "p": 1.0}
+
+
+def test_gap_of_gaps_is_their_difference():
+    a, b, c, d = (rows(count) for count in (9, 4, 6, 5))
+    found = outcome_gap([(1, [a, a]), (-1, [b]), (-1, [c]), (1, [d, d, d])])
+    assert found["gap"] == pytest.approx(50 - 10)

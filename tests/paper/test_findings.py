@@ -1,55 +1,72 @@
 """The paper's claims, tested on made-up results."""
 
+import json
+
 import pytest
 from made_up import flags, write
 
+from dynmap_rl.paper.claims import list_pairs
 from dynmap_rl.paper.findings import (
-    DROPS,
     FAILED,
     HOLDS,
     OPEN,
     compare_cells,
-    list_pairs,
     markdown_claims,
     markdown_comparisons,
+    markdown_transfer,
 )
 from dynmap_rl.paper.published import TABLES
 from dynmap_rl.paper.results import read_cells
 
+BETTER = "Dynamics are better than Only-RGB"
+RECURRENT = "Recurrent policies are better than feed-forward ones"
+
 
 def compare(folder):
-    """Return the comparisons by claim and by what is compared."""
-    return {(row["claim"], row["comparison"]): row for row in compare_cells(read_cells(folder))}
+    """Return the comparisons by claim, group, what is compared, and metric."""
+    rows = compare_cells(read_cells(folder))
+    return {(row["claim"], row["group"], row["comparison"], row["metric"]): row for row in rows}
 
 
 def test_every_pair_is_of_cells_that_the_paper_has_and_no_two_are_the_same():
     pairs = list_pairs()
-    for *column, row in (key for pair in pairs for key in (pair.a, pair.b)):
+    for *column, row in (key for pair in pairs for _, key in pair.terms):
         assert row.removesuffix(", plain CNN") in TABLES[tuple(column)]
-    assert len({(pair.claim, pair.comparison) for pair in pairs}) == len(pairs)
+    names = {(pair.claim, pair.group, pair.comparison, pair.metric) for pair in pairs}
+    assert len(names) == len(pairs)
+
+
+def test_gaps_of_the_paper_are_those_of_its_tables():
+    gaps = {(p.claim, p.group, p.comparison, p.metric): p.paper_gap for p in list_pairs()}
+    assert gaps[BETTER, "task 1, feed-forward", "RGB+[P+V]", "SR"] == 85 - 21
+    assert gaps[BETTER, "task 1, feed-forward, plain CNN", "RGB+[P+V]", "DR"] == 7 - 55
+    assert gaps[BETTER, "task 1, feed-forward", "RGB+[A]", "PE"] == 80 - 69
+    less = "Recurrent policies gain less by dynamics", "task 1, decoupled", "RGB+[V]", "SR"
+    assert gaps[less] == (85 - 79) - (73 - 21)
 
 
 def test_cells_that_are_there_are_compared_on_their_start_states(tmp_path):
     assert compare(tmp_path) == {}
     write(tmp_path, "Only-RGB", 20, 22, 18)
-    write(tmp_path, "RGB+[V]", 38, 36, 40)
+    write(tmp_path, "RGB+[V]", 38, 36, 40, position_error=[0.02] * 40)
     write(tmp_path, "RGB+[V]", 30, policy="feedforward")
     found = compare(tmp_path)
+    metrics = "SR", "DR", "PE"
     assert set(found) == {
-        ("Dynamics beat Only-RGB", "task 1, recurrent: RGB+[V] - Only-RGB"),
-        ("Recurrent policies beat feed-forward ones", "RGB+[V]"),
-        (DROPS, "RGB+[V]"),
+        *((BETTER, "task 1, recurrent", "RGB+[V]", metric) for metric in metrics),
+        *((RECURRENT, "task 1, decoupled", "RGB+[V]", metric) for metric in metrics),
     }
-    better = found["Dynamics beat Only-RGB", "task 1, recurrent: RGB+[V] - Only-RGB"]
-    assert better["rates"] == [95.0, 50.0] and better["gap"] == pytest.approx(45.0)
-    assert better["interval"][0] > 20 and (better["scenes"], better["world_models"]) == (40, [3, 3])
-    assert better["verdict"] == HOLDS and better["group"] == "without position"
+    better = found[BETTER, "task 1, recurrent", "RGB+[V]", "SR"]
+    assert better["values"] == [95.0, 50.0] and better["gap"] == pytest.approx(45.0)
+    assert better["interval"][0] > 20 and better["world_models"] == [3, 3]
+    assert better["verdict"] == HOLDS and better["paper"] == 85 - 73
+    assert found[BETTER, "task 1, recurrent", "RGB+[V]", "PE"]["gap"] == pytest.approx(10.0)
     text = markdown_comparisons(list(found.values()))
-    assert "| task 1, recurrent: RGB+[V] - Only-RGB | 95.0 - 50.0 | +45.0 [" in text
-    assert "**Decoupled training beats joint training**" not in text
+    assert "| task 1, recurrent: RGB+[V] | SR % | 95.0, 50.0 | +45.0 [" in text
+    assert "**Decoupled training" not in text
 
 
-COMPARISON = "Dynamics beat Only-RGB", "task 1, recurrent: RGB+[P] - Only-RGB"
+COMPARISON = BETTER, "task 1, recurrent", "RGB+[P]", "SR"
 
 
 @pytest.mark.parametrize(
@@ -82,28 +99,62 @@ def test_a_claim_needs_a_gap_beyond_that_of_scenes_and_of_world_models(
 def test_policies_on_the_same_world_models_are_compared_in_pairs(tmp_path, recurrent, feedforward, verdict):
     write(tmp_path, "Only-RGB", *recurrent)
     write(tmp_path, "Only-RGB", *feedforward, policy="feedforward")
-    found = compare(tmp_path)["Recurrent policies beat feed-forward ones", "Only-RGB"]
+    found = compare(tmp_path)[RECURRENT, "task 1, decoupled", "Only-RGB", "SR"]
     assert found["verdict"] == verdict
 
 
-def test_drops_are_compared_as_drops(tmp_path):
+def test_fewer_drops_and_smaller_errors_are_better(tmp_path):
+    name = RECURRENT, "task 1, decoupled", "Only-RGB"
     for policy, dropped in (("recurrent", 0), ("feedforward", 10)):
-        write(tmp_path, "Only-RGB", 20, 20, policy=policy, dropped=flags(dropped))
-    [row] = [row for (claim, _), row in compare(tmp_path).items() if claim == DROPS]
+        errors = [(3 + dropped) / 1000] * 40
+        write(tmp_path, "Only-RGB", 20, 20, policy=policy, dropped=flags(dropped), position_error=errors)
+    row = compare(tmp_path)[*name, "DR"]
     assert row["verdict"] == OPEN and row["trainings"] is None, "no variation between world models"
-    write(tmp_path, "Only-RGB", 20, policy="feedforward", dropped=flags(11))
-    [row] = [row for (claim, _), row in compare(tmp_path).items() if claim == DROPS]
-    assert row["gap"] == pytest.approx(-26.25)
-    assert row["verdict"] == HOLDS, "fewer drops are better"
+    errors = [0.014] * 40
+    write(tmp_path, "Only-RGB", 20, policy="feedforward", dropped=flags(11), position_error=errors)
+    row = compare(tmp_path)[*name, "DR"]
+    assert row["gap"] == pytest.approx(-26.25) and row["verdict"] == HOLDS
+    row = compare(tmp_path)[*name, "PE"]
+    assert row["gap"] == pytest.approx(-10.5) and row["trainings"] == pytest.approx((-16.9, -4.1), abs=0.1)
+    assert row["verdict"] == HOLDS
+
+
+def test_a_gain_is_compared_with_that_of_the_other_policies(tmp_path):
+    for row, policy, successes in (
+        ("Only-RGB", "recurrent", (30, 31, 33)),
+        ("RGB+[V]", "recurrent", (35, 34, 36)),
+        ("Only-RGB", "feedforward", (10, 12, 11)),
+        ("RGB+[V]", "feedforward", (36, 37, 34)),
+    ):
+        write(tmp_path, row, *successes, policy=policy)
+    found = compare(tmp_path)[
+        "Recurrent policies gain less by dynamics", "task 1, decoupled", "RGB+[V]", "SR"
+    ]
+    gains = (105 - 94) / 120, (107 - 33) / 120
+    assert found["gap"] == pytest.approx(100 * (gains[0] - gains[1])) and found["verdict"] == HOLDS
+    assert found["values"] == pytest.approx([100 * (105 - 107) / 120, 100 * (94 - 33) / 120])
 
 
 def test_verdicts_are_counted(tmp_path):
-    task = "bin_dropping"
     for row, successes in (("Only-RGB", 20), ("RGB+[P]", 40), ("RGB+[V]", 5), ("RGB+[A]", 20)):
-        write(tmp_path, row, successes, successes - 1, task=task)
-    found, claim = compare(tmp_path), "Dynamics beat Only-RGB on task 3"
-    verdicts = {name.split(" - ")[0]: row["verdict"] for (c, name), row in found.items() if c == claim}
+        write(tmp_path, row, successes, successes - 1, task="bin_dropping")
+    found, group = compare(tmp_path), "task 3, decoupled"
+    verdicts = {name: row["verdict"] for (claim, _, name, _), row in found.items() if claim == BETTER}
     assert verdicts == {"RGB+[P]": HOLDS, "RGB+[V]": FAILED, "RGB+[A]": OPEN}
     lines = markdown_claims(list(found.values())).splitlines()
-    assert f"| {claim} | without position | **open** | 0 | 1 | 1 | -37.5 to +0.0 |" in lines
-    assert f"| {claim} | with position | **holds** | 1 | 0 | 0 | +50.0 |" in lines
+    gaps = "-3 to +11 | -37.5 to +50.0 points"
+    assert f"| {BETTER} | {group} | SR | {gaps} | 1 | 1 | 1 | **open** |" in lines
+    assert "- World models are better than End-to-End: task 1, joint" in lines
+
+
+def test_predictions_are_compared_by_task(tmp_path):
+    for task, error in (
+        ("balance_reaching", 5.0),
+        ("balance_reaching_obstacle", 6.0),
+        ("bin_dropping", 700.0),
+    ):
+        write(tmp_path, "RGB+[P]", 20, 20, task=task)
+        for number, path in enumerate(sorted(tmp_path.glob(f"{task}_decoupled*.json"))):
+            facts = json.loads(path.read_text()) | {"test_protocol": {"localization": error + number}}
+            path.write_text(json.dumps(facts))
+    assert "| RGB+[P] | 5.5 | 6.5 | 700.5 |" in markdown_transfer(read_cells(tmp_path)).splitlines()
