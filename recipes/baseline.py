@@ -48,7 +48,7 @@ class Config:
     run: Path | None = None
     # Seeds of the policies, which are trained one after the other.
     seeds: str = "0,1,2"
-    # Optimiser steps.
+    # Updates of the weights (the steps of lerobot-train).
     steps: int = 4000
     # Samples in a batch.
     batch: int = 32

@@ -119,11 +119,11 @@ def main(config: Config) -> None:
 def load_pretrained(config: Config):
     """Load the world model of another run of the same task and supervision."""
     from dynmap_rl.modules.supervision import parse_supervision
-    from dynmap_rl.runs.lookup import load_source
+    from dynmap_rl.runs.lookup import load_world_model_of
 
     names = [field.name for field in fields(WorldModelTraining) if field.name != "supervision"]
     refuse(config.world_model, WorldModelTraining(), names, "--pretrained", "world_model.")
-    world_model, source = load_source(config.pretrained)
+    world_model, source = load_world_model_of(config.pretrained)
     expected = {"task": config.task, "training": "decoupled"}
     if source != expected or world_model.supervision != parse_supervision(config.world_model.supervision):
         raise ValueError(

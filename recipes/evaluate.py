@@ -170,7 +170,7 @@ def judge_expert(config: Config) -> tuple[Path, str, dict]:
 
     task = get_task(config.task or "balance_reaching")
     expert, seeds = config.expert or task.name, scene_seeds(config.eval.split, config.eval.episodes)
-    if task.is_scripted:
+    if task.has_demonstrator:
         refuse(config, Config(), ["expert", "checkpoint"], f"{config.task}, which has an expert of its own")
         expert, checkpoint = "scripted", "demonstrator"
         outcomes, draw = judge_demonstrator(task, seeds), partial(film_demonstrator, config.task)

@@ -1,7 +1,7 @@
-"""Generalisation (paper, Sec. V-D): policies for task 2 or 3 on a frozen world model of task 1.
+"""Generalisation (paper, Sec. V-C): policies for task 2 or 3 on a frozen world model of task 1.
 
-    python recipes/decoupled.py                                  # trains the world model of task 1
-    python recipes/generalize.py --task balance_reaching_obstacle
+    python recipes/generalize.py --task balance_reaching_obstacle    # on the shipped world model
+    python recipes/decoupled.py --world_model.supervision none
     python recipes/generalize.py --task bin_dropping --pretrained runs/decoupled/balance_reaching/none_recurrent
 
 Demonstrations are recorded with the shipped expert where they are missing. The same command resumes a stopped run, and
@@ -26,7 +26,7 @@ class Config:
     # Task to learn: balance_reaching_obstacle, bin_dropping, or module:Class of your own.
     task: str = "balance_reaching_obstacle"
     # Run whose world model is used: a folder, a hub id, or balance_reaching (shipped).
-    pretrained: str = "runs/decoupled/balance_reaching/position_velocity_recurrent"
+    pretrained: str = "balance_reaching"
     # Dataset: a folder or a hub id; by default datasets/TASK, recorded where it is missing.
     dataset: str | None = None
     # Folder for decoded datasets; by default DATASET.cache beside the dataset.
@@ -57,7 +57,7 @@ def main(config: Config) -> None:
     from dynmap_rl.reporting.run_page import row_text, write_report
     from dynmap_rl.runs.folder import open_run, plain_settings
     from dynmap_rl.runs.loggers import check_logger
-    from dynmap_rl.runs.lookup import load_source
+    from dynmap_rl.runs.lookup import load_world_model_of
     from dynmap_rl.training.dagger import check_corrections
     from dynmap_rl.training.dataset import check_dataset, find_or_record
     from dynmap_rl.training.decoupled import check_same, train_policies
@@ -70,7 +70,7 @@ def main(config: Config) -> None:
     check_corrections(config.policy, config.task)
     if config.dataset:
         check_dataset(config.dataset, config.task)
-    world_model, source = load_source(config.pretrained)
+    world_model, source = load_world_model_of(config.pretrained)
     if source.get("task") == config.task:
         raise ValueError(
             f"--task must differ from the task of --pretrained, got {config.task} for both; choose another --task, or "

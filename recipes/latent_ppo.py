@@ -51,7 +51,7 @@ def main(config: Config) -> None:
     from dynmap_rl.reporting.html import write_html
     from dynmap_rl.runs.folder import open_run, plain_settings
     from dynmap_rl.runs.loggers import check_logger
-    from dynmap_rl.runs.lookup import load_source
+    from dynmap_rl.runs.lookup import load_world_model_of
     from dynmap_rl.training.decoupled import check_same
     from dynmap_rl.training.ppo import train_ppo
     from dynmap_rl.utils.devices import seed_everything
@@ -65,7 +65,7 @@ def main(config: Config) -> None:
         raise ValueError("--threads and --hidden must be at least 1")
     check_logger(config.logger)
     task, ppo = get_task(config.task, kind=Task), config.ppo
-    world_model, source = load_source(config.pretrained)
+    world_model, source = load_world_model_of(config.pretrained)
     world_model.requires_grad_(False)
     expert = experts.load_expert(config.expert or config.task)
     states_of = experts.task_of_expert(config.expert or config.task, task)

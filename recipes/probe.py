@@ -110,11 +110,11 @@ def load_world_models(runs: list[str]) -> dict:
 
     from dynmap_rl.envs.world import ACTION_LIMIT
     from dynmap_rl.modules.supervision import row_name
-    from dynmap_rl.runs.lookup import load_source
+    from dynmap_rl.runs.lookup import load_world_model_of
 
     models = {}
     for run in dict.fromkeys(run.strip().rstrip("/") for run in runs):
-        world_model, source = load_source(run)
+        world_model, source = load_world_model_of(run)
         if "task" not in source or world_model.transition.action.size != len(ACTION_LIMIT):
             raise ValueError(f"--runs must be of tasks 1 to 3, got {run}")
         row = f"{row_name(world_model.supervision, source['training'])}, {source['training']}"

@@ -5,15 +5,13 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDictBase
 
+from .settings import Augmentation
+
 METERS_PER_PIXEL = 1 / 64
 
 
 def augment(
-    windows: TensorDictBase,
-    generator: torch.Generator,
-    max_shift: int = 6,
-    mirror: bool = True,
-    recolor: bool = True,
+    windows: TensorDictBase, generator: torch.Generator, settings: Augmentation | None = None
 ) -> TensorDictBase:
     """Mirror, shift and recolour windows at random, each window in its own way.
 
@@ -25,15 +23,23 @@ def augment(
         windows: ``[B, T]`` with ``pixels`` and, to be mirrored or shifted, ``action`` ``[B, T, 3]``, ``goal`` ``[B, T, 2]``
             and ``dynamics`` ``[B, T, D]``: x, y and theta of one body after the other, or x and y of a point, in SI units.
         generator: source of the random numbers, on the device of the windows.
-        max_shift: largest shift along either axis, in pixels.
-        mirror: mirror every other window, on average.
-        recolor: permute the colour channels.
+        settings: what is changed; default :class:`dynmap_rl.data.Augmentation`.
 
     Returns:
         New windows ``[B, T]``.
+
+    Raises:
+        ValueError: action or goal have other sizes, and the windows are to be mirrored or shifted.
     """
+    settings = settings or Augmentation()
+    max_shift, mirror, recolor = settings.max_shift, settings.mirror, settings.recolor
     batch = windows.shape[0]
     windows = windows.exclude("agent_pos", "state")
+    sizes = {key: windows[key].shape[-1] for key in ("action", "goal") if key in windows}
+    if (mirror or max_shift) and sizes != {"action": 3, "goal": 2}:
+        raise ValueError(
+            f"windows must have action [3] and goal [2] to be mirrored or shifted, got {sizes}; use Augmentation.off()"
+        )
     if not (mirror or max_shift or recolor):
         return windows
     # All numbers are always drawn, so that an option does not change what the others draw.

@@ -210,6 +210,6 @@ class BaseTask(ABC):
         return limit * np.resize(direction, len(limit)) * (np.arange(len(limit)) < len(direction))
 
     @property
-    def is_scripted(self) -> bool:
+    def has_demonstrator(self) -> bool:
         """Whether the task has a demonstrator."""
         return type(self).demonstrator is not BaseTask.demonstrator

@@ -35,8 +35,7 @@ class Renderer:
 
     Args:
         size: side of the frame in pixels.
-        supersample: factor by which the picture is drawn larger and then averaged; 1 gives hard edges, as in the
-            paper.
+        supersample: factor by which the picture is drawn larger and then averaged; 1 gives hard edges.
 
     Raises:
         ValueError: the size or the factor is not positive.

@@ -155,7 +155,7 @@ class BinDropping(Task):
 
     Reward, -5 to 1 a step: with the block in the bin 1, minus small penalties on the cart's speed and tilt; before
     that ``0.2 exp(-4 d)`` for a distance d (m) from block to goal; in both cases minus a small penalty on the cart's
-    acceleration; -5 once the block missed the bin or the cart touched it. The paper's reward has a 1 and a -1 alone.
+    acceleration; -5 once the block missed the bin or the cart touched it.
 
     End: the block fell below the bin's floor beside it, or the cart touched the bin.
 

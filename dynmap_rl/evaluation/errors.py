@@ -11,7 +11,7 @@ from torch import nn
 from dynmap_rl.data.features import compute_features
 from dynmap_rl.modules.actor import STATES
 from dynmap_rl.modules.world_model import WorldModel
-from dynmap_rl.objectives.imitation import ImitationLoss, imitation_loss
+from dynmap_rl.objectives.imitation import imitation_loss
 
 GROUPS = {"": (0, 1), "_angle": (2,)}  # entries of a body's dynamics (x, y, theta) that share a unit
 
@@ -51,12 +51,6 @@ def prediction_errors(
         for name, value in errors.items():
             sums[f"error_{name}"] = sums.get(f"error_{name}", 0.0) + value.item() * len(chunk) / len(episodes)
     return sums
-
-
-@torch.no_grad()
-def policy_error(world_model: WorldModel, policy: nn.Module, episodes: TensorDictBase) -> float:
-    """Return the plain L1 loss of a policy on episodes ``[E, T]`` (normalised units)."""
-    return ImitationLoss(policy)(compute_features(world_model, episodes))["loss_policy"].item()
 
 
 @torch.no_grad()

@@ -52,8 +52,14 @@ def write_source_page(results: Path, tasks: list[str], architecture: str = "glim
     written.append(results / "data.png")
     plot_data(results, "balance_reaching", written[-1])
     parts += ["## Number of demonstrations", data_table(results, "balance_reaching"), "![data](data.png)"]
-    commands = sorted({read_json(path)["command"] for path in results.glob("*.json")})
-    parts += ["## Commands", "\n".join(["```bash", *commands, "```"])]
+    commands = {read_json(path)["command"] for path in results.glob("*.json")}
+    commands = sorted(commands, key=lambda command: ("--pretrained" in command, command))
+    form = "" if architecture == "glimpse" else f" --architecture {architecture}"
+    parts += [
+        "## Commands",
+        f"`python recipes/paper/sources.py{form} --only SOURCE` also derives the dataset of a source.",
+        "\n".join(["```bash", *commands, "```"]),
+    ]
     written.append(results / "README.md")
     write_bytes(written[-1], ("\n\n".join(parts) + "\n").encode())
     return written

@@ -16,7 +16,7 @@ from dynmap_rl.modules.world_model import WorldModel
 from dynmap_rl.reporting.figures import plt, save_figure
 from dynmap_rl.utils.files import read_json
 
-from .sources import DATA_ROWS, POLICIES, SIZES, SOURCES, WORLD_MODELS, cell_name, dataset_folder
+from .sources import DATA_ROWS, POLICIES, SIZES, SOURCES, WORLD_MODELS, dataset_folder, name_run
 from .tables import join_table
 
 CONTEXT, HORIZON = 20, 40  # steps with frames, and then without
@@ -83,7 +83,7 @@ def read_source(results: Path, task: str, source: str, policy: str, size: int = 
         start states, the SR of each of the ``world_models``, their number, and the mean of each of the ``measures``;
         None without a result.
     """
-    names = [cell_name(task, source, seed, policy, size) for seed in WORLD_MODELS]
+    names = [name_run(task, source, seed, policy, size) for seed in WORLD_MODELS]
     names = names[:1] if source == "end_to_end" else names
     found = [read_json(path) for name in names if (path := results / f"{name}.json").exists()]
     if not found:
@@ -94,9 +94,7 @@ def read_source(results: Path, task: str, source: str, policy: str, size: int = 
     measured = [
         read_json(path)
         for seed in WORLD_MODELS
-        if (
-            path := results / "measures" / f"{cell_name(task, source, seed, 'recurrent', size)}.json"
-        ).exists()
+        if (path := results / "measures" / f"{name_run(task, source, seed, 'recurrent', size)}.json").exists()
     ]
     return {
         **{name: everything[name] for name in ("SR", "DR", "PE")},
@@ -186,8 +184,8 @@ def measured_points(results: Path, task: str, policy: str, measure: str) -> tupl
     for source in SOURCES:
         pairs = []
         for seed in WORLD_MODELS:
-            path = results / f"{cell_name(task, source, seed, policy)}.json"
-            measured = results / "measures" / f"{cell_name(task, source, seed, 'recurrent')}.json"
+            path = results / f"{name_run(task, source, seed, policy)}.json"
+            measured = results / "measures" / f"{name_run(task, source, seed, 'recurrent')}.json"
             if path.exists() and measured.exists():
                 rows = [row for of_seed in result_rows(read_json(path)) for row in of_seed]
                 pairs.append((read_json(measured)[measure], summarize(rows)["SR"]))

@@ -1,4 +1,4 @@
-"""Where the dynamics come from, and how many demonstrations: the cells of the grid, and the datasets they train on."""
+"""Where the dynamics come from, and how many demonstrations: the runs of the grid, and the datasets they train on."""
 
 from __future__ import annotations
 
@@ -73,37 +73,37 @@ DATA_ROWS = {
 }
 
 
-def list_source_cells(
+def list_source_runs(
     tasks: tuple[str, ...] = TASKS[:1],
     datasets: Path = Path("datasets/sources"),
     only: Container[str] = tuple(SOURCES),
     seeds: tuple[int, ...] = WORLD_MODELS,
     architecture: str = "glimpse",
 ) -> list[Run]:
-    """Return the cells of the table, those that train world models first.
+    """Return the runs of the table, those that train world models first.
 
     Args:
-        tasks: tasks of the cells. A task that is not in the plane has only the sources without columns of their own.
+        tasks: tasks of the runs. A task that is not in the plane has only the sources without columns of their own.
         datasets: folder of the derived datasets.
         only: sources to list.
         seeds: seeds of the world models.
-        architecture: form of the world models; cells of another form have the same names and need other folders.
+        architecture: form of the world models; runs of another form have the same names and need other folders.
     """
-    cells = []
+    runs = []
     for task in tasks:
         planar = get_task(task).planar
         names = [name for name, s in SOURCES.items() if name in only and (planar or s.columns is None)]
-        cells += [_cell(task, name, seed, datasets, 300, architecture) for seed in seeds for name in names]
-    return cells + [_reuse(cell) for cell in cells]
+        runs += [_train(task, name, seed, datasets, 300, architecture) for seed in seeds for name in names]
+    return runs + [_reuse(run) for run in runs]
 
 
-def list_data_cells(
+def list_data_runs(
     datasets: Path = Path("datasets/sources"),
     only: Container[str] = tuple(DATA_ROWS),
     seeds: tuple[int, ...] = WORLD_MODELS,
     architecture: str = "glimpse",
 ) -> list[Run]:
-    """Return the cells of the amount of data on task 1; those of 300 demonstrations are cells of the table too.
+    """Return the runs of the amount of data on task 1; those of 300 demonstrations are runs of the table too.
 
     Args:
         datasets: folder of the datasets.
@@ -111,32 +111,32 @@ def list_data_cells(
         seeds: seeds of the world models; the run of end-to-end training has its own.
         architecture: form of the world models; end-to-end training has none but the default.
     """
-    cells = []
+    runs = []
     for size in SIZES:
         names = [name for name in DATA_ROWS if name in only and name in SOURCES]
-        cells += [
-            _cell(TASKS[0], name, seed, datasets, size, architecture) for seed in seeds for name in names
+        runs += [
+            _train(TASKS[0], name, seed, datasets, size, architecture) for seed in seeds for name in names
         ]
         if "end_to_end" in only and architecture == "glimpse":
             dataset = str(dataset_folder(TASKS[0], "simulator", datasets, size))
             arguments = ("--task", TASKS[0], "--dataset", dataset, "--eval.paper_episodes", "0")
-            name = cell_name(TASKS[0], "end_to_end", 0, "recurrent", size)
+            name = name_run(TASKS[0], "end_to_end", 0, "recurrent", size)
             cell = TASKS[0], "joint", "recurrent", DATA_ROWS["end_to_end"]
-            cells.append(Run(name, "end_to_end", cell, arguments, table="sources"))
-    return cells
+            runs.append(Run(name, "end_to_end", cell, arguments, table="sources"))
+    return runs
 
 
-def cell_name(task: str, source: str, seed: int, policy: str, size: int = 300) -> str:
-    """Return the name of a cell."""
+def name_run(task: str, source: str, seed: int, policy: str, size: int = 300) -> str:
+    """Return the name of a run."""
     amount = "" if size == 300 else f"_{size}_demonstrations"
     model = "" if source == "end_to_end" else f"_world_model_{seed}"
     return f"{get_task(task).name}_{source}{amount}{model}_{policy}"
 
 
-def find_table_cells(tables: Path, architecture: str = "glimpse") -> dict[str, Path]:
-    """Return results of the runs of the paper's tables that are cells of this grid too, by the name of the cell.
+def find_table_runs(tables: Path, architecture: str = "glimpse") -> dict[str, Path]:
+    """Return results of runs of the paper's tables that are of this grid too, by the name of the run here.
 
-    These are the cells of task 1 with the simulator's dynamics, and with none.
+    These are runs of task 1 with the simulator's dynamics, and with none.
 
     Args:
         tables: folder of the results of ``recipes/paper/tables.py``.
@@ -150,7 +150,7 @@ def find_table_cells(tables: Path, architecture: str = "glimpse") -> dict[str, P
         )
         path = tables / f"{TASKS[0]}_{training}_{supervision}_{policy}{suffix}.json"
         if path.exists():
-            found[cell_name(TASKS[0], source, seed, policy)] = path
+            found[name_run(TASKS[0], source, seed, policy)] = path
     return found
 
 
@@ -162,15 +162,15 @@ def dataset_folder(task: str, source: str, datasets: Path, size: int = 300) -> P
     return datasets / (f"{name}_{source}" if size == 300 else f"{name}_{size}_{source}")
 
 
-def make_datasets(cells: list[Run], datasets: Path, workers: int = 1) -> None:
-    """Record and derive the datasets of cells that are missing.
+def make_datasets(runs: list[Run], datasets: Path, workers: int = 1) -> None:
+    """Record and derive the datasets of runs that are missing.
 
     Args:
-        cells: cells of :func:`list_source_cells` and :func:`list_data_cells`.
+        runs: runs of :func:`list_source_runs` and :func:`list_data_runs`.
         datasets: folder of the derived datasets.
         workers: processes that record.
     """
-    wanted = {cell.arguments[cell.arguments.index("--dataset") + 1]: cell.task for cell in cells}
+    wanted = {run.arguments[run.arguments.index("--dataset") + 1]: run.task for run in runs}
     for task in sorted(set(wanted.values())):
         for size in SIZES:
             recording = dataset_folder(task, "simulator", datasets, size)
@@ -187,17 +187,17 @@ def make_datasets(cells: list[Run], datasets: Path, workers: int = 1) -> None:
                     add_dynamics(recording, folder, **source.columns, replace=True)
 
 
-def copy_quality(cells: list[Run], results: Path) -> None:
-    """Copy the quality of the cells' derived datasets to ``quality/DATASET.json`` in the folder of the results."""
-    for folder in {Path(cell.dataset) for cell in cells if cell.dataset}:
+def copy_quality(runs: list[Run], results: Path) -> None:
+    """Copy the quality of the runs' derived datasets to ``quality/DATASET.json`` in the folder of the results."""
+    for folder in {Path(run.dataset) for run in runs if run.dataset}:
         if (judged := folder / DERIVED).exists():
             write_json(results / "quality" / f"{folder.name}.json", read_json(judged))
 
 
-def _cell(
+def _train(
     task: str, name: str, seed: int, datasets: Path, size: int = 300, architecture: str = "glimpse"
 ) -> Run:
-    """Return the cell that trains a world model and recurrent policies."""
+    """Return the run that trains a world model and recurrent policies."""
     source = SOURCES[name]
     arguments = (
         "--task", task, "--dataset", str(dataset_folder(task, name, datasets, size)),
@@ -206,19 +206,19 @@ def _cell(
     )  # fmt: skip
     arguments += () if architecture == "glimpse" else ("--world_model.architecture", architecture)
     cell = task, "decoupled", "recurrent", source.text
-    return Run(cell_name(task, name, seed, "recurrent", size), "decoupled", cell, arguments, table="sources")
+    return Run(name_run(task, name, seed, "recurrent", size), "decoupled", cell, arguments, table="sources")
 
 
-def _reuse(cell: Run) -> Run:
-    """Return the cell that trains feed-forward policies on the world model of a recurrent cell."""
-    name = f"{cell.name.removesuffix('recurrent')}feedforward"
-    shared = cell.arguments[: cell.arguments.index("--world_model.seed")]
-    task, training, _, row = cell.cell
+def _reuse(run: Run) -> Run:
+    """Return the run that trains feed-forward policies on the world model of a recurrent run."""
+    name = f"{run.name.removesuffix('recurrent')}feedforward"
+    shared = run.arguments[: run.arguments.index("--world_model.seed")]
+    task, training, _, row = run.cell
     return Run(
         name,
-        cell.recipe,
+        run.recipe,
         (task, training, "feedforward", row),
         (*shared, "--policy.kind", "feedforward"),
-        needs=cell.name,
-        table=cell.table,
+        needs=run.name,
+        table=run.table,
     )

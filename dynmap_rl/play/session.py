@@ -107,7 +107,7 @@ class Session:
     @property
     def drivers(self) -> tuple[str, ...]:
         """Drivers that are available."""
-        expert = self.expert is not None or self.task.is_scripted
+        expert = self.expert is not None or self.task.has_demonstrator
         available = {"person": True, "expert": expert, "policy": self.actor is not None}
         return tuple(driver for driver in DRIVERS if available[driver])
 
@@ -211,7 +211,7 @@ class Session:
 
 def _find_expert(task: BaseTask, name: str | Path, named: bool):
     """Return an expert and the task whose state it reads; None twice where none is named and none ships."""
-    if task.is_scripted:
+    if task.has_demonstrator:
         if named:
             raise ValueError(f"--expert has no effect with {task.name}, which has an expert of its own")
         return None, None

@@ -61,7 +61,7 @@ def load_actor(run: str | Path, seed: int = 0) -> Actor:
     return Actor(world_model, load_policy(run / f"seed_{seed}" / "policy"), mixed=True)
 
 
-def load_source(run: str | Path) -> tuple[WorldModel, dict[str, str]]:
+def load_world_model_of(run: str | Path) -> tuple[WorldModel, dict[str, str]]:
     """Load the world model of a finished run, with its origin.
 
     Args:

@@ -1,4 +1,4 @@
-"""Policies on a frozen world model, for decoupled training and generalisation (paper, Sec. III-B and V-D).
+"""Policies on a frozen world model, for decoupled training and generalisation (paper, Sec. III-B and V-C).
 
 The world model's states are computed once. Every policy is then trained, and judged, in a process of its own. The
 fingerprint of the world model is the same before and after.

@@ -10,7 +10,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import nn
 
-from dynmap_rl.evaluation.errors import policy_error, prediction_errors
+from dynmap_rl.data.features import compute_features
+from dynmap_rl.evaluation.errors import policy_errors, prediction_errors
 from dynmap_rl.modules.checkpoints import load_world_model, make_policy, save_policy, save_world_model
 from dynmap_rl.modules.world_model import WorldModel
 from dynmap_rl.objectives.joint import JointLoss
@@ -68,7 +69,7 @@ def train_jointly(
 
     def held_out() -> dict[str, float]:
         errors = prediction_errors(world_model, episodes["eval"], by_entry=by_entry)
-        return errors | {"held_out_loss": policy_error(world_model, policy, episodes["eval"])}
+        return errors | _policy_loss(world_model, policy, episodes["eval"])
 
     model = nn.ModuleDict({"world_model": world_model, "policy": policy})
     fit(model, make, episodes["train"], held_out, folder, settings, seed, logger, save_every)
@@ -106,10 +107,15 @@ def train_end_to_end(
         return JointLoss(WorldModelLoss(world_model), policy, 1.0, settings.emphasis, end_to_end=True)
 
     def held_out() -> dict[str, float]:
-        return {"held_out_loss": policy_error(world_model, policy, episodes["eval"])}
+        return _policy_loss(world_model, policy, episodes["eval"])
 
     model = nn.ModuleDict({"world_model": world_model, "policy": policy})
     fit(model, make, episodes["train"], held_out, folder, settings, seed, logger, save_every)
+
+
+def _policy_loss(world_model: WorldModel, policy: nn.Module, episodes: TensorDictBase) -> dict[str, float]:
+    errors = policy_errors(policy, compute_features(world_model, episodes))
+    return {"held_out_loss": errors["imitation_l1"]}
 
 
 @dataclass(frozen=True)
@@ -123,6 +129,7 @@ class _Work:
     settings: EndToEndTraining
     judge: Judge
     device: str
+    threads: int
     logger: str | None
     by_entry: bool
 
@@ -164,7 +171,10 @@ def train_seeds(
     """
     compute, folder = compute or Compute(), Path(folder)
     todo = [seed for seed in seeds if not (folder / f"seed_{seed}" / "eval.json").exists()]
-    work = _Work(load, folder, world_model, policy, settings, judge, compute.device, logger, by_entry)
+    threads = compute.threads if len(todo) == 1 else 1
+    work = _Work(
+        load, folder, world_model, policy, settings, judge, compute.device, threads, logger, by_entry
+    )
     # Processes that train together train one seed after the other.
     workers = compute.threads if ranks() == 1 else 1
     run_processes([_train_and_evaluate], [(work, seed) for seed in todo], workers)
@@ -177,7 +187,7 @@ def train_seeds(
 
 def _train_and_evaluate(arguments: tuple[_Work, int]) -> None:
     work, seed = arguments
-    torch.set_num_threads(1)
+    torch.set_num_threads(work.threads)
     seed_everything(2000 + seed)
     episodes, constants = work.load()
     device = choose_device(work.device)

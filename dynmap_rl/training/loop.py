@@ -12,7 +12,6 @@ from torch import nn
 from tqdm import tqdm
 
 from dynmap_rl.data.augmentation import augment
-from dynmap_rl.data.settings import Augmentation
 from dynmap_rl.data.windows import sample_windows
 from dynmap_rl.modules.precision import mixed_precision
 from dynmap_rl.runs.folder import load_training_state, save_training_state, truncate_metrics
@@ -96,7 +95,7 @@ def fit(
         windows = sample_windows(episodes, batch, length, generator, part).to(device)
         if own is not generator:
             own.manual_seed((1000 * seed + update) * ranks() + rank())
-        windows = change_windows(windows, settings.augmentation, own)
+        windows = augment(windows, own, settings.augmentation)
         with mixed_precision(device):
             losses = loss_module(windows)
         norm = step(sum(losses.values()), optimizer)
@@ -141,13 +140,6 @@ def share_gradients(loss_module: nn.Module, some: bool = False) -> nn.Module:
     return nn.parallel.DistributedDataParallel(
         _Losses(loss_module), broadcast_buffers=False, find_unused_parameters=some
     )
-
-
-def change_windows(
-    windows: TensorDictBase, settings: Augmentation, generator: torch.Generator
-) -> TensorDictBase:
-    """Apply the augmentations of the settings to windows ``[B, T]``."""
-    return augment(windows, generator, settings.max_shift, settings.mirror, settings.recolor)
 
 
 def _restore(generator: torch.Generator, state: torch.Tensor, update: int) -> None:

@@ -38,7 +38,7 @@ class WorldModelArchitecture:
 class WorldModelTraining(WorldModelArchitecture):
     """Form and training of a world model (paper, Eq. 4a and 5)."""
 
-    # Optimiser steps.
+    # Updates of the weights.
     updates: int = 900
     # Windows in a batch.
     windows: int = 12
@@ -52,7 +52,7 @@ class WorldModelTraining(WorldModelArchitecture):
     imagined: float = 0.5
     # Frames of a batch that are decoded, drawn at random.
     rgb_frames: int = 72
-    # Peak learning rate (100 steps of warm-up, then a cosine).
+    # Peak learning rate (100 updates of warm-up, then a cosine).
     learning_rate: float = 2e-3
     # Weight of rare colours in the RGB loss: a pixel's weight falls with this power of the number of pixels of its
     # colour; 0 is the paper's plain L2.
@@ -106,18 +106,18 @@ class PolicyArchitecture:
 class PolicyTraining(PolicyArchitecture):
     """Form and training of a policy on the states of a frozen world model."""
 
-    # Optimiser steps.
+    # Updates of the weights.
     updates: int = 1200
     # Episodes in a batch.
     batch: int = 16
-    # Peak learning rate (100 steps of warm-up, then a cosine).
+    # Peak learning rate (100 updates of warm-up, then a cosine).
     learning_rate: float = 3e-3
     # Extra weight of steps in which the expert changes its action (see imitation_loss); 0 is the paper's plain L1.
     emphasis: float = 60.0
     # Scenes of training in which the trained policy acts and the task's expert says what it would have done (DAgger).
     # Their states join the demonstrations', and training goes on.
     corrections: int = 0
-    # Optimiser steps with the corrections.
+    # Updates of the weights with the corrections.
     correction_updates: int = 800
 
     def __post_init__(self):
@@ -130,7 +130,7 @@ class PolicyTraining(PolicyArchitecture):
 class EndToEndTraining:
     """Training of world model and policy by the policy's loss alone (paper, Eq. 3)."""
 
-    # Optimiser steps.
+    # Updates of the weights.
     updates: int = 2500
     # Windows in a batch.
     windows: int = 8
@@ -139,7 +139,7 @@ class EndToEndTraining:
     # Share of the updates, at first, whose batches have the same number of frames in windows of 4 steps (see
     # WorldModelTraining).
     short_windows: float = 0.4
-    # Peak learning rate (100 steps of warm-up, then a cosine).
+    # Peak learning rate (100 updates of warm-up, then a cosine).
     learning_rate: float = 2e-3
     # Extra weight of steps in which the expert changes its action (see imitation_loss); 0 is the paper's plain L1.
     emphasis: float = 60.0

@@ -98,7 +98,7 @@ def choose_labelled(episodes: TensorDictBase, share: float, seed: int) -> torch.
     """
     count, steps = episodes.shape
     index = episodes.get("episode", None)
-    index = torch.arange(count) if index is None else index.reshape(count, steps)[:, 0].cpu()
+    index = torch.arange(count) if index is None else index[:, 0].cpu()
     unique = index.unique()
     order = torch.randperm(len(unique), generator=torch.Generator().manual_seed(seed))
     chosen = torch.isin(index, unique[order[: max(1, round(share * len(unique)))]])

@@ -21,7 +21,7 @@ class Compute:
 
     # cpu, cuda, or auto: the GPU where PyTorch finds one.
     device: str = "auto"
-    # Cores: threads of one training, or trainings at a time.
+    # CPU cores: threads of one training or evaluation, or processes of one thread each, for several seeds or batches.
     threads: int = 2
 
     def __post_init__(self):

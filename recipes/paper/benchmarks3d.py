@@ -1,12 +1,12 @@
 """Run the grid of the MuJoCo tasks: world models, end-to-end training, ACT and Diffusion Policy; write the page.
 
-    python recipes/paper/benchmarks3d.py --dry_run                    # cells, those that are complete, remaining time
+    python recipes/paper/benchmarks3d.py --dry_run                    # runs, those that are complete, remaining time
     python recipes/paper/benchmarks3d.py --only plateslide --workers 2
     python recipes/paper/benchmarks3d.py --results runs/benchmarks3d_results     # a grid of your own
     python recipes/paper/benchmarks3d.py --write                      # the page from the results alone
 
-A cell is a run of another recipe for one task, method and seed, and its result a JSON file; cells with a result are skipped.
-The same command resumes a stopped grid, and every cell. Three rows have dynamics that are derived from the recordings, in
+A run is one of another recipe for one task, method and seed, and its result a JSON file; runs with a result are skipped.
+The same command resumes a stopped grid and its runs. Three rows have dynamics that are derived from the recordings, in
 datasets/TASK_hand, _tracks and _color. The page has success, failures by cause, and animations. Needs
 pip install '.[lerobot,mujoco]'.
 """
@@ -27,9 +27,9 @@ RECIPES = Path(__file__).parents[1]
 class Config:
     """Settings of the recipe."""
 
-    # Folder of the cells' results; by default that of the repository.
+    # Folder of the results; by default that of the repository.
     results: Path = RECIPES / "results/benchmarks3d"
-    # Folder of the cells' runs.
+    # Folder of the runs.
     runs: Path = Path("runs/benchmarks3d")
     # Cells to run: a part of their names.
     only: str = ""
@@ -37,9 +37,9 @@ class Config:
     episodes: int = 500
     # Cells at a time on this machine; each takes two cores if it is alone, otherwise one.
     workers: int = 1
-    # Folder with a settings file RECIPE.yaml for any of the recipes, passed to their cells as --config_path.
+    # Folder with a settings file RECIPE.yaml for any of the recipes, passed to them as --config_path.
     presets: Path | None = None
-    # List the cells and stop.
+    # List the runs and stop.
     dry_run: bool = False
     # Write README.md and table.json in the folder of the results from the results alone, and stop.
     write: bool = False
@@ -51,7 +51,7 @@ class Config:
 
 
 def main(config: Config) -> None:
-    """Run the cells without a result, and write the page."""
+    """Execute the runs without a result, and write the page."""
     from dynmap_rl.paper.benchmarks import derive_dataset, list_benchmarks
     from dynmap_rl.paper.launch import execute, is_done, launch, print_runs
     from dynmap_rl.paper.sources import copy_quality
@@ -59,31 +59,31 @@ def main(config: Config) -> None:
 
     if config.write:
         return write(config)
-    cells = [cell for cell in list_benchmarks(config.episodes).values() if config.only in cell.name]
-    if not cells:
-        raise ValueError(f"--only must be a part of a cell's name, got {config.only!r}; see --dry_run")
-    todo = [cell for cell in cells if not is_done(cell.name, config.results)]
-    for path in (config.results / f"{cell.name}.json" for cell in cells if cell not in todo):
+    runs = [run for run in list_benchmarks(config.episodes).values() if config.only in run.name]
+    if not runs:
+        raise ValueError(f"--only must be a part of a run's name, got {config.only!r}; see --dry_run")
+    todo = [run for run in runs if not is_done(run.name, config.results)]
+    for path in (config.results / f"{run.name}.json" for run in runs if run not in todo):
         if (scenes := read_json(path)["test_protocol"]["episodes"]) != config.episodes:
             raise ValueError(
                 f"{path} has {scenes} --episodes instead of {config.episodes}; choose another --results"
             )
     if config.dry_run:
-        return print_runs(cells, todo)
+        return print_runs(runs, todo)
     from dynmap_rl.training.dataset import find_or_record
 
-    recordings = {task: find_or_record(task) for task in sorted({cell.task for cell in todo})}
-    for cell in todo:  # cells must not record or derive at the same time
-        if cell.dataset:
-            task = cell.task.removeprefix("mujoco:")
-            derive_dataset(task, recordings[cell.task], cell.cell[-1], Path(cell.dataset))
-    run = partial(
+    recordings = {task: find_or_record(task) for task in sorted({run.task for run in todo})}
+    for run in todo:  # runs must not record or derive at the same time
+        if run.dataset:
+            task = run.task.removeprefix("mujoco:")
+            derive_dataset(task, recordings[run.task], run.cell[-1], Path(run.dataset))
+    start = partial(
         execute, recipes=RECIPES, results=config.results, runs=config.runs,
         threads=2 if config.workers == 1 else 1, presets=config.presets, root=Path.cwd(),
     )  # fmt: skip
-    failed = launch(todo, run, workers=config.workers)
-    copy_quality(cells, config.results)
-    copy_pictures(cells, config)
+    failed = launch(todo, start, workers=config.workers)
+    copy_quality(runs, config.results)
+    copy_pictures(runs, config)
     write(config)
     if failed:
         raise ValueError("; ".join(failed))
@@ -104,14 +104,14 @@ def write(config: Config) -> None:
     print(f"written: {config.results / 'README.md'}, {config.results / 'table.json'}")
 
 
-def copy_pictures(cells: list, config: Config) -> None:
+def copy_pictures(runs: list, config: Config) -> None:
     """Copy the animation of RGB+[P+V] with the first seed, failures first, to the results."""
     from dynmap_rl.utils.files import write_bytes
 
-    for cell in cells:
-        animation = config.runs / cell.name / "rollouts.gif"
-        if cell.name.endswith("rgb_p_v_seed_0") and animation.exists():
-            write_bytes(config.results / f"{cell.name}.gif", animation.read_bytes())
+    for run in runs:
+        animation = config.runs / run.name / "rollouts.gif"
+        if run.name.endswith("rgb_p_v_seed_0") and animation.exists():
+            write_bytes(config.results / f"{run.name}.gif", animation.read_bytes())
 
 
 if __name__ == "__main__":

@@ -8,8 +8,8 @@
 Each run is evaluated under each condition: on stale frames; with the world model rolled forward; with a delay that is
 reported wrongly; with jitter, lost frames, and pushes that the policy is not told; and, in the place of its policy, with
 a feed-forward policy that is trained to act on an old state of the run's world model and the actions since. A run and a
-condition have one JSON file, with a cell for each delay, written after every cell; cells that are there are skipped, so
-that the same command resumes a stopped grid. A LeRobot policy, such as ACT, is evaluated with chunks from which the
+condition have one JSON file, with an entry for each delay, written after every one; entries that are there are skipped,
+so that the same command resumes a stopped grid. A LeRobot policy, such as ACT, is evaluated with chunks from which the
 actions of the delay are cut; train one with the command in dynmap_rl/integrations/lerobot/README.md.
 """
 
@@ -46,7 +46,7 @@ class Config:
     results: Path = RESULTS / "delays"
     # File of the figure.
     figure: Path = RESULTS / "media/delays.png"
-    # List the cells and stop.
+    # List the measurements and stop.
     dry_run: bool = False
     # Draw the figure and write the table, README.md in the folder of the results, from the results alone.
     write: bool = False

@@ -25,11 +25,12 @@ from torch import nn
 from torch.profiler import ProfilerActivity, profile
 from torch.utils.flop_counter import FlopCounterMode
 
+from dynmap_rl.data.augmentation import augment
 from dynmap_rl.data.windows import sample_windows
 from dynmap_rl.keys import DYNAMICS
 from dynmap_rl.modules.checkpoints import make_world_model
 from dynmap_rl.modules.precision import mixed_precision
-from dynmap_rl.training.loop import change_windows, make_optimizer, step
+from dynmap_rl.training.loop import make_optimizer, step
 from dynmap_rl.training.settings import WorldModelTraining
 from dynmap_rl.training.world_model import make_loss
 from dynmap_rl.utils.cli import command_line
@@ -94,7 +95,7 @@ class Update:
 
     def draw(self) -> TensorDict:
         windows = sample_windows(self.episodes, self.settings.windows, STEPS, self.generator)
-        return change_windows(windows, self.settings.augmentation, self.generator)
+        return augment(windows, self.generator, self.settings.augmentation)
 
     def learn(self, windows: TensorDict) -> None:
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.mixed, cache_enabled=False):

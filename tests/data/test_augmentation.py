@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from dynmap_rl.data.augmentation import augment
+from dynmap_rl.data.settings import Augmentation
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 
 
@@ -57,7 +58,7 @@ def test_goal_moves_with_the_cart():
 def test_a_mirrored_window_is_mirrored_in_all_its_entries():
     episodes = make_episodes()
     episodes["expert_action"] = 2 * episodes["action"]
-    out = augment(episodes, torch.Generator().manual_seed(0), max_shift=0, recolor=False)
+    out = augment(episodes, torch.Generator().manual_seed(0), Augmentation(max_shift=0, recolor=False))
     mirrored = (out["goal"] != episodes["goal"]).any(-1)[:, 0]
     assert 0 < mirrored.sum() < 8
     for a, b, flip in zip(out, episodes, mirrored, strict=True):
@@ -74,14 +75,14 @@ def test_a_mirrored_window_is_mirrored_in_all_its_entries():
 def test_options_leave_the_other_changes_as_they_are():
     episodes = make_episodes()
     every, same_colors = (
-        augment(episodes, torch.Generator().manual_seed(3), recolor=r) for r in (True, False)
+        augment(episodes, torch.Generator().manual_seed(3), Augmentation(recolor=r)) for r in (True, False)
     )
     assert (every.exclude("pixels") == same_colors.exclude("pixels")).all()
     assert not torch.equal(every["pixels"], same_colors["pixels"])
     assert torch.equal(every["pixels"].sum(2), same_colors["pixels"].sum(2)), "channels are permuted"
-    plain = augment(episodes, torch.Generator().manual_seed(3), mirror=False)["goal"]
+    plain = augment(episodes, torch.Generator().manual_seed(3), Augmentation(mirror=False))["goal"]
     assert torch.equal(plain[..., 1], every["goal"][..., 1]) and not torch.equal(plain, every["goal"])
-    off = augment(episodes, torch.Generator(), max_shift=0, mirror=False, recolor=False)
+    off = augment(episodes, torch.Generator(), Augmentation(max_shift=0, mirror=False, recolor=False))
     assert (off == episodes.select(*off.keys())).all()
 
 

@@ -67,7 +67,7 @@ def test_failures_are_replaced_by_the_next_candidates(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "CANDIDATES_PER_SHARD", 10)
     for scripted, advice in ((False, "train a better expert"), (True, "improve its demonstrator")):
         monkeypatch.setattr(
-            module, "get_task", lambda name, scripted=scripted: SimpleNamespace(is_scripted=scripted)
+            module, "get_task", lambda name, scripted=scripted: SimpleNamespace(has_demonstrator=scripted)
         )
         with pytest.raises(ValueError, match=advice):
             module._roll_out_shard(shard)

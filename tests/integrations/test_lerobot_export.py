@@ -21,7 +21,7 @@ from dynmap_rl.modules.checkpoints import (
     save_world_model,
 )
 from dynmap_rl.modules.checkpoints import make_policy as make_own_policy
-from dynmap_rl.runs.lookup import load_source, task_of_run
+from dynmap_rl.runs.lookup import load_world_model_of, task_of_run
 from dynmap_rl.utils.files import read_json, write_json
 from dynmap_rl.utils.weights import fingerprint
 
@@ -76,7 +76,7 @@ def test_task_and_source_of_a_run_are_kept(tmp_path):
     exported = export_to_lerobot(run, tmp_path / "exported", seed=1)
     back = import_from_lerobot(exported, tmp_path / "back", seed=1)
     assert task_of_run(back) == task_of_run(exported) == "bin_dropping"
-    model, found = load_source(back)
+    model, found = load_world_model_of(back)
     assert (fingerprint(model), found) == (fingerprint(world_model), source)
     assert read_json(back / "eval.json") == {"world_model": source, "imported_from": str(exported)}
     with pytest.raises(ValueError, match="another"):
@@ -85,7 +85,7 @@ def test_task_and_source_of_a_run_are_kept(tmp_path):
     (run / "eval.json").unlink()  # not done yet
     unfinished = export_to_lerobot(run, tmp_path / "unfinished", seed=1)
     with pytest.raises(ValueError, match="again"):
-        load_source(import_from_lerobot(unfinished, tmp_path / "again", seed=1))
+        load_world_model_of(import_from_lerobot(unfinished, tmp_path / "again", seed=1))
 
 
 def test_a_policy_of_lerobot_train_has_the_task_of_its_dataset(recording, tmp_path):
@@ -94,7 +94,7 @@ def test_a_policy_of_lerobot_train_has_the_task_of_its_dataset(recording, tmp_pa
     make_policy(config, ds_meta=dataset.meta).save_pretrained(tmp_path / "pretrained_model")
     run = import_from_lerobot(tmp_path / "pretrained_model", tmp_path / "run")
     assert task_of_run(run) == "balance_reaching"
-    assert load_source(run)[1] == {"task": "balance_reaching", "training": "joint"}
+    assert load_world_model_of(run)[1] == {"task": "balance_reaching", "training": "joint"}
 
 
 def test_a_policy_of_lerobot_train_has_the_sizes_of_its_dataset(recording, tmp_path):

@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from dynmap_rl.runs.lookup import SHIPPED, find_run, load_actor, load_source, task_of_run
+from dynmap_rl.runs.lookup import SHIPPED, find_run, load_actor, load_world_model_of, task_of_run
 from dynmap_rl.utils.files import write_json
 from dynmap_rl.utils.weights import fingerprint
 
@@ -32,19 +32,19 @@ def test_the_hub_that_cannot_be_reached_is_named(tmp_path, monkeypatch):
 
 
 def test_the_world_model_of_a_run_with_its_origin(run):
-    model, source = load_source(run)
-    same, same_source = load_source(run / "world_model")
+    model, source = load_world_model_of(run)
+    same, same_source = load_world_model_of(run / "world_model")
     assert fingerprint(model) == fingerprint(same)
     assert source == same_source == {"task": OURS, "training": "decoupled"}
     with pytest.raises(ValueError, match="no finished run"):
-        load_source(run / "seed_0")
+        load_world_model_of(run / "seed_0")
 
 
 def test_the_world_model_of_one_seed_of_a_joint_run(run):
     write_json(run / "eval.json", {"world_model": {"task": OURS, "training": "joint"}})
     (run / "world_model").rename(run / "seed_0/world_model")
     for folder in (run / "seed_0", run / "seed_0/world_model"):
-        model, source = load_source(folder)
+        model, source = load_world_model_of(folder)
         assert source == {"task": OURS, "training": "joint"} and model.supervision
 
 

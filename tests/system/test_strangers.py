@@ -9,7 +9,7 @@ from commands import run
 
 from dynmap_rl.data.derive import add_dynamics
 from dynmap_rl.experts.network import CHECKPOINTS
-from dynmap_rl.runs.lookup import SHIPPED, find_run, load_actor, load_source, task_of_run
+from dynmap_rl.runs.lookup import SHIPPED, find_run, load_actor, load_world_model_of, task_of_run
 from recipes.robot import Config, default_folder
 
 
@@ -80,4 +80,4 @@ def test_only_json_and_safetensors_of_a_run_are_opened(stranger, monkeypatch):
     monkeypatch.setattr(torch, "load", None)
     folder = find_run(str(stranger))
     assert task_of_run(folder) == "balance_reaching"
-    assert load_actor(folder).world_model.supervision == load_source(folder)[0].supervision
+    assert load_actor(folder).world_model.supervision == load_world_model_of(folder)[0].supervision

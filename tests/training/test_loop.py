@@ -7,10 +7,11 @@ import pytest
 import torch
 from small import WORLD_MODEL, Stop, make_episodes, make_model
 
+from dynmap_rl.data.augmentation import augment
 from dynmap_rl.data.settings import Augmentation
 from dynmap_rl.runs.folder import append_metrics, load_training_state, read_metrics
 from dynmap_rl.training import loop
-from dynmap_rl.training.loop import change_windows, check_loss
+from dynmap_rl.training.loop import check_loss
 from dynmap_rl.training.settings import EndToEndTraining, JointTraining, WorldModelTraining, windows_at
 from dynmap_rl.training.world_model import train_world_model
 from dynmap_rl.utils.weights import fingerprint
@@ -131,11 +132,11 @@ def test_short_windows_come_first_and_hold_as_many_frames(kind):
 
 def test_windows_change_as_the_settings_say():
     windows, generator = make_episodes()["train"], torch.Generator().manual_seed(0)
-    same = change_windows(windows.clone(), Augmentation.off(), generator)
+    same = augment(windows.clone(), generator, Augmentation.off())
     assert (same == windows).all()
     for name, value in vars(Augmentation()).items():
         changes = vars(Augmentation.off()) | {name: value}
-        changed = change_windows(windows.clone(), Augmentation(**changes), generator)
+        changed = augment(windows.clone(), generator, Augmentation(**changes))
         assert not torch.equal(changed["pixels"], windows["pixels"]), name
         labels = torch.equal(changed["dynamics", "position"], windows["dynamics", "position"])
         assert labels is (name == "recolor")

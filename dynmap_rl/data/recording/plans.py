@@ -96,7 +96,7 @@ def plan_exploration(
         count: number of episodes.
         expert: folder or task of the expert's checkpoints; by default the expert that ships for the task.
     """
-    checkpoints, detours = find_checkpoints(task, expert), 0 if get_task(task).is_scripted else 3
+    checkpoints, detours = find_checkpoints(task, expert), 0 if get_task(task).has_demonstrator else 3
     return [
         Plan(
             scene_seed(split, i),
@@ -118,7 +118,7 @@ def find_checkpoints(task: str, expert: str | Path | None = None) -> list[str]:
     Raises:
         ValueError: there is no checkpoint, or the task has a demonstrator and another expert is given.
     """
-    if not get_task(task).is_scripted:
+    if not get_task(task).has_demonstrator:
         return list_checkpoints(expert or task)
     if expert not in (None, task):
         raise ValueError(f"--expert has no effect with {task}, which has an expert of its own; leave it out")
@@ -137,7 +137,7 @@ def roll_out(task: str, plans: list[Plan], expert: str | Path | None = None) -> 
         ``[E, T]`` with ``pixels``, ``agent_pos``, ``goal``, ``dynamics``, ``action`` as executed, ``expert_action``
         without noise and pushes, and under ``next`` ``reward``, ``done``, ``is_success``, ``dropped``, ``position_error``.
     """
-    if get_task(task).is_scripted:
+    if get_task(task).has_demonstrator:
         return demonstrate(task, plans)
     n = len(plans)
     env = DynmapBatchedEnv(task, n, from_pixels=True)

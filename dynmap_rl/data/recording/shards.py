@@ -137,7 +137,7 @@ def merge_shards(shards: list[Shard], folder: Path, settings: dict) -> None:
 def _roll_out_shard(shard: Shard) -> tuple[list[Plan], TensorDict]:
     """Return the first ``count`` candidates that succeed, or simply the first of an exploration."""
     plans, kept, missing, start = [], [], shard.count, 0
-    one_by_one = get_task(shard.task).is_scripted  # no batch, in which some more take hardly longer
+    one_by_one = get_task(shard.task).has_demonstrator  # no batch, in which some more take hardly longer
     while missing:
         size = missing if shard.kind == "exploration" or one_by_one else missing + missing // 8 + 2
         if start + size > CANDIDATES_PER_SHARD:

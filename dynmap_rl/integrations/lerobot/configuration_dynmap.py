@@ -47,7 +47,7 @@ class DynmapConfig(PreTrainedConfig):
         optimizer_weight_decay: weight decay of AdamW.
         sizes: numbers of entries of action, goal and dynamics; written by training.
         task: task of the dataset; written by training.
-        source: origin of the world model (see :func:`dynmap_rl.runs.load_source`); written by training.
+        source: origin of the world model (see :func:`dynmap_rl.runs.load_world_model_of`); written by training.
 
     Raises:
         ValueError: supervision or kind is unknown, windows have less than two steps, or ``delay`` is not below

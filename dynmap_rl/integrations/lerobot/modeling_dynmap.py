@@ -13,6 +13,7 @@ from tensordict import TensorDict
 from dynmap_rl.data.augmentation import augment
 from dynmap_rl.data.demonstrations import find_meta
 from dynmap_rl.data.normalization import normalization_constants
+from dynmap_rl.data.settings import Augmentation
 from dynmap_rl.envs.world import ACTION_LIMIT
 from dynmap_rl.keys import DYNAMICS
 from dynmap_rl.modules.actor import Actor
@@ -145,8 +146,8 @@ class DynmapPolicy(PreTrainedPolicy):
     def _augment(self, windows: TensorDict) -> TensorDict:
         # Seeded by torch's own generator, which LeRobot saves and restores.
         generator = torch.Generator(windows.device).manual_seed(torch.randint(2**62, ()).item())
-        limits = {} if self.symmetric else {"max_shift": 0, "mirror": False}
-        return augment(windows, generator, recolor=self.config.recolor, **limits)
+        moved = {} if self.symmetric else {"max_shift": 0, "mirror": False}
+        return augment(windows, generator, Augmentation(recolor=self.config.recolor, **moved))
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, torch.Tensor], **kwargs) -> torch.Tensor:
