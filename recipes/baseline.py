@@ -4,7 +4,7 @@
     python recipes/baseline.py --task mujoco:PlateSlide --policy diffusion
     python recipes/baseline.py --full_size --steps 100000 --batch 8            # LeRobot's sizes, for a GPU
 
-Needs pip install '.[lerobot]'. The policies read frames and observation.state, which holds the goal. They are smaller than
+Needs uv pip install -e '.[lerobot]'. The policies read frames and observation.state, which holds the goal. They are smaller than
 LeRobot's defaults, for two cores, and all weights begin at random. The same command resumes a stopped run at LeRobot's
 last checkpoint, and prints the result of a finished one.
 """
@@ -99,7 +99,7 @@ def check_lerobot() -> None:
     from importlib.util import find_spec
 
     if missing := [name for name in ("accelerate", "diffusers") if find_spec(name) is None]:
-        raise ValueError(f"LeRobot's training needs {' and '.join(missing)}: pip install '.[lerobot]'")
+        raise ValueError(f"LeRobot's training needs {' and '.join(missing)}: uv pip install -e '.[lerobot]'")
 
 
 def train(config: Config, dataset: str | Path, folder: Path, seed: int, device: str) -> None:

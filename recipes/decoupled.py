@@ -79,7 +79,7 @@ def main(config: Config) -> None:
     if config.dataset:
         check_dataset(config.dataset, config.task)
     world_model = load_pretrained(config) if config.pretrained else None
-    source = {"task": config.task, "training": "decoupled"}
+    origin = {"task": config.task, "training": "decoupled"}
     name = f"{config.world_model.supervision.replace(',', '_')}_{config.policy.kind}"
     folder = config.run or Path("runs/decoupled") / task.name / name
     open_run(folder, config, ignore=("run", "cache", "compute", "logger"))
@@ -110,7 +110,7 @@ def main(config: Config) -> None:
     )  # fmt: skip
     result = write_report(
         folder, world_model, episodes["eval"], seeds,
-        task=config.task, dataset=dataset, policy=config.policy.kind, source=source,
+        task=config.task, dataset=dataset, policy=config.policy.kind, origin=origin,
         settings=plain_settings(config), command=command_line(sys.argv), frozen=fingerprint, compare=paper_numbers,
     )  # fmt: skip
     print(f"\n{row_text(result, paper_numbers(result))}\nwritten: {folder}")
@@ -123,12 +123,12 @@ def load_pretrained(config: Config):
 
     names = [field.name for field in fields(WorldModelTraining) if field.name != "supervision"]
     refuse(config.world_model, WorldModelTraining(), names, "--pretrained", "world_model.")
-    world_model, source = load_world_model_of(config.pretrained)
+    world_model, origin = load_world_model_of(config.pretrained)
     expected = {"task": config.task, "training": "decoupled"}
-    if source != expected or world_model.supervision != parse_supervision(config.world_model.supervision):
+    if origin != expected or world_model.supervision != parse_supervision(config.world_model.supervision):
         raise ValueError(
             f"--pretrained must be a decoupled world model of {config.task} with --world_model.supervision "
-            f"{config.world_model.supervision}, got {source} with {world_model.supervision}; for another task use "
+            f"{config.world_model.supervision}, got {origin} with {world_model.supervision}; for another task use "
             "recipes/generalize.py"
         )
     return world_model

@@ -93,7 +93,7 @@ def main(config: Config) -> None:
     result = write_report(
         folder, world_model, load_dataset(dataset, "eval", config.cache), seeds,
         task=config.task, dataset=dataset, policy=config.policy.kind,
-        source={"task": config.task, "training": "end_to_end"},
+        origin={"task": config.task, "training": "end_to_end"},
         settings=plain_settings(config), command=command_line(sys.argv), compare=paper_numbers,
     )  # fmt: skip
     print(f"\n{row_text(result, paper_numbers(result))}\nwritten: {folder}")

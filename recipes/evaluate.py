@@ -151,7 +151,7 @@ def load_policy(config: Config, folder: Path, instruction: str):
         from dynmap_rl.integrations.lerobot import LeRobotActor
     except ImportError as error:
         raise ValueError(
-            f"--policy must be a run, got {config.policy}; LeRobot policies need pip install '.[lerobot]' ({error})"
+            f"--policy must be a run, got {config.policy}; LeRobot policies need uv pip install -e '.[lerobot]' ({error})"
         ) from error
     refuse(config, Config(), ["seed"], "a LeRobot policy")
     return LeRobotActor(config.policy, instruction=instruction)
@@ -165,7 +165,7 @@ def judge_expert(config: Config) -> tuple[Path, str, dict]:
     from dynmap_rl.evaluation.rollout import failures_first
     from dynmap_rl.evaluation.statistics import wilson
     from dynmap_rl.experts.careless import CarelessController
-    from dynmap_rl.experts.network import list_checkpoints, load_expert, roll_out, task_of_expert
+    from dynmap_rl.experts.network import list_checkpoints, load_expert, play_to_end, task_of_expert
     from dynmap_rl.reporting.media import film, film_demonstrator
 
     task = get_task(config.task or "balance_reaching")
@@ -181,7 +181,7 @@ def judge_expert(config: Config) -> tuple[Path, str, dict]:
         else:
             checkpoint = config.checkpoint or list_checkpoints(expert)[-1]
             network, trained_on = load_expert(expert, checkpoint), task_of_expert(expert, task)
-        outcomes = list_outcomes(task, roll_out(network, task, seeds, states=trained_on))
+        outcomes = list_outcomes(task, play_to_end(network, task, seeds, states=trained_on))
         draw = partial(film, network, task, states=trained_on)
     rates = {name: 100 * sum(values) / len(seeds) for name, values in outcomes.items()}
     intervals = {name: wilson(sum(values), len(seeds)) for name, values in outcomes.items()}

@@ -70,17 +70,17 @@ def main(config: Config) -> None:
     check_corrections(config.policy, config.task)
     if config.dataset:
         check_dataset(config.dataset, config.task)
-    world_model, source = load_world_model_of(config.pretrained)
-    if source.get("task") == config.task:
+    world_model, origin = load_world_model_of(config.pretrained)
+    if origin.get("task") == config.task:
         raise ValueError(
             f"--task must differ from the task of --pretrained, got {config.task} for both; choose another --task, or "
             "use recipes/decoupled.py"
         )
-    if "task" not in source or world_model.transition.action.size != len(task.layout.action_limit):
+    if "task" not in origin or world_model.transition.action.size != len(task.layout.action_limit):
         raise ValueError(
             f"--pretrained must be of a task with the actions of {config.task}, got {config.pretrained}"
         )
-    name = f"{source['training']}_{'_'.join(world_model.supervision) or 'none'}_{config.policy.kind}"
+    name = f"{origin['training']}_{'_'.join(world_model.supervision) or 'none'}_{config.policy.kind}"
     folder = config.run or Path("runs/generalize") / task.name / name
     open_run(folder, config, ignore=("run", "cache", "compute", "logger"))
     if (folder / "eval.json").exists():
@@ -99,7 +99,7 @@ def main(config: Config) -> None:
     )  # fmt: skip
     result = write_report(
         folder, world_model, episodes["eval"], seeds,
-        task=config.task, dataset=dataset, policy=config.policy.kind, source=source,
+        task=config.task, dataset=dataset, policy=config.policy.kind, origin=origin,
         settings=plain_settings(config), command=command_line(sys.argv), frozen=fingerprint, compare=paper_numbers,
     )  # fmt: skip
     print(f"\n{row_text(result, paper_numbers(result))}\nwritten: {folder}")

@@ -96,7 +96,7 @@ def main(config: Config) -> None:
     result = write_report(
         folder, world_model, load_dataset(dataset, "eval", config.cache), seeds,
         task=config.task, dataset=dataset, policy=config.policy.kind,
-        source={"task": config.task, "training": "joint"},
+        origin={"task": config.task, "training": "joint"},
         settings=plain_settings(config), command=command_line(sys.argv), compare=paper_numbers,
     )  # fmt: skip
     print(f"\n{row_text(result, paper_numbers(result))}\nwritten: {folder}")

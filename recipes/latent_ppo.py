@@ -65,7 +65,7 @@ def main(config: Config) -> None:
         raise ValueError("--threads and --hidden must be at least 1")
     check_logger(config.logger)
     task, ppo = get_task(config.task, kind=Task), config.ppo
-    world_model, source = load_world_model_of(config.pretrained)
+    world_model, origin = load_world_model_of(config.pretrained)
     world_model.requires_grad_(False)
     expert = experts.load_expert(config.expert or config.task)
     states_of = experts.task_of_expert(config.expert or config.task, task)
@@ -95,10 +95,10 @@ def main(config: Config) -> None:
     train_ppo(make, network, folder, ppo, judge=judge, facts=facts, **common)
     if fingerprint(world_model) != frozen_weights:
         raise ValueError("the frozen world model has changed; this run is not valid")
-    states = rates(task, experts.roll_out(expert, task, fresh_scenes(ppo.final_episodes), states_of))
+    states = rates(task, experts.play_to_end(expert, task, fresh_scenes(ppo.final_episodes), states_of))
     result = {
         "task": config.task,
-        "world_model_of": source,
+        "world_model_of": origin,
         "supervision": list(world_model.supervision),
         "world_model_sha256": frozen_weights,
         "latents": read_json(folder / "checkpoint" / f"iteration_{ppo.iterations:03d}.json"),

@@ -114,10 +114,10 @@ def load_world_models(runs: list[str]) -> dict:
 
     models = {}
     for run in dict.fromkeys(run.strip().rstrip("/") for run in runs):
-        world_model, source = load_world_model_of(run)
-        if "task" not in source or world_model.transition.action.size != len(ACTION_LIMIT):
+        world_model, origin = load_world_model_of(run)
+        if "task" not in origin or world_model.transition.action.size != len(ACTION_LIMIT):
             raise ValueError(f"--runs must be of tasks 1 to 3, got {run}")
-        row = f"{row_name(world_model.supervision, source['training'])}, {source['training']}"
+        row = f"{row_name(world_model.supervision, origin['training'])}, {origin['training']}"
         if world_model.architecture != "glimpse":
             row += f", {world_model.architecture}"
         models[row, run] = world_model

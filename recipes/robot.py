@@ -110,7 +110,7 @@ def main(config: Config) -> None:
     result = write_robot_report(
         folder, world_model, episodes["eval"], seeds,
         dataset=config.dataset, camera=config.camera, goal=config.goal, policy=config.policy.kind,
-        source={"training": config.method, "dataset": config.dataset},
+        origin={"training": config.method, "dataset": config.dataset},
         settings=plain_settings(config), command=command_line(sys.argv), frozen=fingerprint,
     )  # fmt: skip
     print(f"\n{robot_row_text(result)}\nwritten: {folder}")

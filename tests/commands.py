@@ -83,6 +83,6 @@ def open_in_browser(page: Path, picture: Path) -> dict:
     command = [sys.executable, BROWSER, page, picture]
     result = subprocess.run(command, capture_output=True, text=True, timeout=200)
     if "ModuleNotFoundError" in result.stderr or "cannot open shared object file" in result.stderr:
-        pytest.skip(f"pip install '.[browser]' and its libraries: {result.stderr.splitlines()[-1]}")
+        pytest.skip(f"uv pip install -e '.[browser]' and its libraries: {result.stderr.splitlines()[-1]}")
     assert result.returncode == 0, result.stderr
     return json.loads(result.stdout)

@@ -30,7 +30,7 @@ def own_task(tmp_path_factory):
 
 def check_renderer() -> None:
     """Skip the test where MuJoCo is missing or cannot draw."""
-    pytest.importorskip("mujoco", reason="pip install '.[mujoco]'")
+    pytest.importorskip("mujoco", reason="uv pip install -e '.[mujoco]'")
     from dynmap_rl.envs.mujoco.rendering import make_canvas
 
     try:

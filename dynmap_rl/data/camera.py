@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from dynmap_rl.envs.task import BODIES
 
 from .flow import flow_velocity
 from .format.frames import choose_camera, iterate_frames
+from .motion import Motion
 from .tracking import SORTS, WIDEST, Tracks, track_centroid, track_objects
 
 BODY = "x", "y", "theta"
@@ -20,34 +21,7 @@ MOST = 250  # objects: their numbers are bytes
 
 
 @dataclass(frozen=True)
-class Motion:
-    """What a source measures in an episode of T steps.
-
-    Attributes:
-        position: ``[T, D]``, float64.
-        angles: entries that are angles.
-        period: period of the angles: 2 pi for radians, 360 for degrees.
-        velocity: ``[T, D]`` per s, where the source measures it itself; None is to be derived.
-        other: a second measurement of the velocity ``[T, D]`` that was not used, for comparison, or None.
-        found: bool ``[T, N]``, whether each object was found in the frame; None for a state.
-        tracks: the objects, for the sources that segment them.
-    """
-
-    position: np.ndarray
-    angles: list[int]
-    period: float = 2 * np.pi
-    velocity: np.ndarray | None = None
-    other: np.ndarray | None = None
-    found: np.ndarray | None = None
-    tracks: Tracks | None = None
-
-    def light(self) -> Motion:
-        """Return the same without the masks, which are as large as the frames."""
-        return replace(self, tracks=replace(self.tracks, labels=None)) if self.tracks else self
-
-
-@dataclass(frozen=True)
-class Camera:
+class FrameSource:
     """How frames are turned into positions.
 
     Attributes:
@@ -99,7 +73,7 @@ def choose_view(
     sort: str = "lowest",
     point: bool = False,
     width: float | None = None,
-) -> Camera:
+) -> FrameSource:
     """Return how frames are read.
 
     Args:
@@ -108,7 +82,7 @@ def choose_view(
         source: ``centroid``, ``tracks`` or ``flow``.
         planar: whether the dataset is a recording of cart and block, whose picture is 1 m wide and shows two objects.
         camera: the camera's column; by default the first one.
-        objects: see :class:`Camera`, also for the next; by default two for a planar recording, otherwise one.
+        objects: see :class:`FrameSource`, also for the next; by default two for a planar recording, otherwise one.
         colors: colour of each object, a name or ``#rrggbb``, instead of ``objects`` and ``sort``.
         threshold: smallest difference of a pixel that moves.
         sort: order of the objects.
@@ -141,7 +115,7 @@ def choose_view(
     if width is not None and not 0 < width < math.inf:
         raise ValueError(f"--width must be above 0, got {width}")
     column = choose_camera(root, info, camera)
-    return Camera(source, column, objects, colors, threshold, sort, point, width)
+    return FrameSource(source, column, objects, colors, threshold, sort, point, width)
 
 
 def _parse_color(text: str) -> tuple[int, int, int]:
@@ -154,7 +128,7 @@ def _parse_color(text: str) -> tuple[int, int, int]:
     return red, green, blue
 
 
-def read_motion(root: Path, info: dict, camera: Camera) -> Iterator[tuple[int, Motion]]:
+def read_motion(root: Path, info: dict, camera: FrameSource) -> Iterator[tuple[int, Motion]]:
     """Iterate over the episodes' motions as a camera sees them.
 
     Args:
@@ -173,7 +147,7 @@ def read_motion(root: Path, info: dict, camera: Camera) -> Iterator[tuple[int, M
             raise ValueError(f"{root}: in episode {episode} {error}") from error
 
 
-def measure(frames: np.ndarray, factor: float, camera: Camera, fps: float) -> Motion:
+def measure(frames: np.ndarray, factor: float, camera: FrameSource, fps: float) -> Motion:
     """Measure the motion in one episode.
 
     Args:
@@ -198,7 +172,7 @@ def measure(frames: np.ndarray, factor: float, camera: Camera, fps: float) -> Mo
     return Motion(position, angles, found=tracks.found, tracks=tracks, **used)
 
 
-def track(frames: np.ndarray, camera: Camera) -> Tracks:
+def track(frames: np.ndarray, camera: FrameSource) -> Tracks:
     """Track the objects of a camera in frames uint8 ``[T, height, width, 3]``."""
     return track_objects(frames, camera.objects, camera.threshold, camera.sort, camera.colors)
 

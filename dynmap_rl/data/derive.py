@@ -13,10 +13,11 @@ from dynmap_rl.envs.task import BODIES, LAYOUT
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.keys import DYNAMICS
 
-from .camera import Camera, Motion, choose_view, read_motion
+from .camera import FrameSource, choose_view, read_motion
 from .demonstrations import DERIVED, META, find_layout, find_meta
 from .format.columns import write_columns
 from .format.reading import find_dataset, read_column, read_info, read_table, spans
+from .motion import Motion
 from .normalization import planar_range, value_range
 from .quality import Derived, judge_quality
 from .state import choose_state, read_state
@@ -105,7 +106,7 @@ def add_dynamics(
         dataset: local folder or hub id.
         output: the new folder.
         source: ``state``, or from the frames ``centroid``, ``tracks`` or ``flow`` (see
-            :class:`dynmap_rl.data.camera.Camera`), or both: ``state,tracks`` or ``state,flow``.
+            :class:`dynmap_rl.data.camera.FrameSource`), or both: ``state,tracks`` or ``state,flow``.
         state: column whose entries are positions. They stay as measured, except for unwrapped angles.
         columns: entries of that column; by default all.
         angles: entries among ``columns`` that are angles and jump by ``period``.
@@ -155,7 +156,7 @@ def add_dynamics(
         view = choose_view(root, info, source.removeprefix("state,"), planar, **frames)
         parts.append((view.names, read_motion(root, info, view), method or "savgol"))
     names = [name for part in parts for name in part[0]]
-    if planar and view and view.names == Camera("tracks", "", len(BODIES) // 3).names == names:
+    if planar and view and view.names == FrameSource("tracks", "", len(BODIES) // 3).names == names:
         names = list(BODIES)
         parts = [(names, *parts[0][1:])]
     if len(set(names)) < len(names):

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .camera import Motion
+from .motion import Motion
 
 SMOOTH = 7, 2  # window and order of the smooth trajectory
 

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from .camera import Motion
 from .format.reading import read_column, read_table, spans
+from .motion import Motion
 
 
 @dataclass(frozen=True)
-class State:
+class StateSource:
     """How a column is turned into positions.
 
     Attributes:
@@ -47,8 +47,8 @@ def choose_state(
     noise: float = 0.0,
     angle_noise: float = 0.0,
     seed: int = 0,
-) -> State:
-    """Check the options of a state and return them as a :class:`State`.
+) -> StateSource:
+    """Check the options of a state and return them as a :class:`StateSource`.
 
     Args:
         info: content of the dataset's ``meta/info.json``.
@@ -78,10 +78,10 @@ def choose_state(
     if unknown := [i for i in angles if i not in columns]:
         raise ValueError(f"--angles must be among --columns {columns}, got {unknown}")
     names, places = entry_names(info, column), [columns.index(i) for i in angles]
-    return State(column, columns, [names[i] for i in columns], places, period, noise, angle_noise, seed)
+    return StateSource(column, columns, [names[i] for i in columns], places, period, noise, angle_noise, seed)
 
 
-def read_state(root: Path, info: dict, state: State) -> Iterator[tuple[int, Motion]]:
+def read_state(root: Path, info: dict, state: StateSource) -> Iterator[tuple[int, Motion]]:
     """Iterate over the episodes' positions in a column.
 
     Args:

@@ -251,7 +251,11 @@ def _make_task(name: str, from_file: bool) -> BaseTask:
     try:
         task = getattr(importlib.import_module(MUJOCO_MODULE if own else module), attribute)
     except (ImportError, AttributeError) as error:
-        hint = "; MuJoCo tasks need pip install '.[mujoco]'" if own and isinstance(error, ImportError) else ""
+        hint = (
+            "; MuJoCo tasks need uv pip install -e '.[mujoco]'"
+            if own and isinstance(error, ImportError)
+            else ""
+        )
         raise ValueError(
             f"the task must be module:Class or module:Class:argument=value, got {name!r} ({error}){hint}"
         ) from error

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDictBase
 
 from dynmap_rl.data.features import compute_features
-from dynmap_rl.data.recording.plans import Plan, roll_out
+from dynmap_rl.data.recording.plans import Plan, run_plans
 from dynmap_rl.envs.scene import GOAL_COLOR, Scene, scene_seeds
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.experts.network import list_checkpoints
@@ -106,7 +106,7 @@ def begin_scenes(task: str, count: int, steps: int = 11) -> tuple[TensorDictBase
     plans = [Plan(seed, checkpoint) for seed in scene_seeds("validation", count)]
     rules = get_task(task)
     scenes = [rules.sample_scene(np.random.default_rng(plan.scene_seed)) for plan in plans]
-    return roll_out(task, plans)[:, :steps], scenes
+    return run_plans(task, plans)[:, :steps], scenes
 
 
 def _explained(values: torch.Tensor, truth: torch.Tensor, guess: torch.Tensor) -> float:

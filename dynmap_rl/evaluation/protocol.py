@@ -48,7 +48,8 @@ def evaluate(
             does not depend on their number. A script that uses more than one must have the guard ``if __name__ == "__main__"``.
 
     Returns:
-        ``test`` on the shared start states and, if ``settings.paper_episodes`` is not 0, ``paper`` on others. Each has
+        ``test`` on the shared scenes of ``settings.split``, whichever that is, and, if ``settings.paper_episodes`` is not 0,
+        ``paper`` on others. Each has
         ``summary`` (see :func:`dynmap_rl.evaluation.summarize`) and ``rows`` (see :func:`pack_rows`).
 
     Raises:

@@ -15,9 +15,9 @@ class Evaluation:
 
     # Split of the scenes: test, or validation while settings are being chosen.
     split: str = "test"
-    # Episodes on shared start states, which are the same for every policy; at most 1000.
+    # Scenes that every policy is evaluated on, the same for all; at most 1000.
     episodes: int = 1000
-    # Episodes on further start states, by the paper's protocol of 50 a policy seed.
+    # Further scenes, by the paper's protocol of 50 a policy seed.
     paper_episodes: int = 50
 
     def __post_init__(self):

@@ -77,7 +77,7 @@ def play(
         step_worlds(worlds, actions)
 
 
-def roll_out(
+def play_to_end(
     network: ExpertNetwork,
     task: Task,
     scene_seeds: Sequence[int],

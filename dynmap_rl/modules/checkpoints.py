@@ -27,6 +27,9 @@ def make_world_model(
 ) -> WorldModel:
     """Make a world model with random weights.
 
+    :func:`dynmap_rl.training.build_world_model` makes one by typed settings, with torchvision's weights where they ask for
+    them.
+
     Args:
         constants: of the dataset's normalisation, ``{name: {"low": [D], "high": [D]}}``.
         supervision: quantities that are decoded.

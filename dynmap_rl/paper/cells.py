@@ -71,7 +71,7 @@ class Run:
         return self.cell[0]
 
     @property
-    def source(self) -> str | None:
+    def needed_run(self) -> str | None:
         """Name of the run whose world model is used, or None."""
         return self.needs and self.needs.partition("/")[0]
 

@@ -141,10 +141,10 @@ def launch_local(
         try:
             while todo or running:
                 open_names = {run.name for run in (*todo, *running.values())}
-                ready = [run for run in todo if run.source not in open_names]
+                ready = [run for run in todo if run.needed_run not in open_names]
                 for run in ready[: workers - len(running)]:
                     todo.remove(run)
-                    future = pool.submit(_start, run.source in failed, start, run)
+                    future = pool.submit(_start, run.needed_run in failed, start, run)
                     running[future] = run
                     future.add_done_callback(ended.put)
                 future = ended.get()
@@ -166,7 +166,7 @@ def launch_ray(
     connect()
     remote, refs = ray.remote(num_cpus=cpus, num_gpus=gpus, max_retries=0)(_start), {}
     for run in runs:  # Ray waits for the result that is an argument
-        refs[run.name] = remote.remote(refs.get(run.source), start, run)
+        refs[run.name] = remote.remote(refs.get(run.needed_run), start, run)
     running = dict(zip(refs.values(), runs, strict=True))
     while running:
         (done,), _ = ray.wait(list(running))

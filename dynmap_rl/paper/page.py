@@ -68,9 +68,8 @@ joint training is better for Only-RGB, and that velocity has the lowest PE.
 Comparisons are of the default encoder unless they name a plain CNN. With the default encoder even Only-RGB nearly solves
 task 1, which leaves no room for gaps. The plain CNN is nearer to the paper, which has "a simple CNN-based encoder" and gives
 neither layers nor sizes; ours is trained with everything else that the default is trained with
-([deviations](../README.md#choices-and-deviations-from-the-paper)). In the paper, most failures of Only-RGB are drops; here
-they are misses, since the demonstrations hardly move the block on the cart
-([demonstrations](../../dynmap_rl/envs/README.md#experts)).
+([deviations](../README.md#choices-and-deviations-from-the-paper)). In the paper, most failures of Only-RGB with
+feed-forward policies are drops; here they are misses, since demonstrations hardly move the block on the cart.
 
 {claims}
 

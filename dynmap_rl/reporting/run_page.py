@@ -36,7 +36,7 @@ def write_report(
     task: str,
     dataset: str | Path,
     policy: str,
-    source: dict[str, str],
+    origin: dict[str, str],
     settings: dict,
     command: str,
     frozen: str | None = None,
@@ -52,7 +52,7 @@ def write_report(
         task: name of the task of the policies.
         dataset: demonstrations that the policies were trained on, a folder or a hub id.
         policy: kind of the policies, ``feedforward`` or ``recurrent``.
-        source: origin of the world model, with ``task`` and ``training`` (decoupled, joint or end_to_end).
+        origin: origin of the world model, with ``task`` and ``training`` (decoupled, joint or end_to_end).
         settings: settings of the run, as a nested dict of JSON values.
         command: command that started the run.
         frozen: fingerprint of the frozen world model; None where every seed has a world model of its own.
@@ -67,11 +67,11 @@ def write_report(
     results = read_results(folder, seeds, frozen)
     test = [unpack_rows(r["test"]["rows"]) for r in results]
     result = {
-        "row": row_name(world_model.supervision, source["training"]),
+        "row": row_name(world_model.supervision, origin["training"]),
         "policy": policy,
         "task": task,
         "trained_on": _describe(dataset),
-        "world_model": source,
+        "world_model": origin,
         "seeds": list(seeds),
         "world_model_sha256": frozen,
         **_paper_protocol(results),
@@ -171,9 +171,9 @@ def _title(result: dict) -> str:
 
 def _label(result: dict) -> str:
     """Return the row's name, and the origin of its world model unless that is decoupled training on the same task."""
-    source = result["world_model"]
-    label = f"{result['row']}, joint" if source["training"] == "joint" else result["row"]
-    return label if source["task"] == result["task"] else f"{label} of {source['task']}"
+    origin = result["world_model"]
+    label = f"{result['row']}, joint" if origin["training"] == "joint" else result["row"]
+    return label if origin["task"] == result["task"] else f"{label} of {origin['task']}"
 
 
 def _cells(numbers: Numbers) -> str:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dynmap_rl.data.camera import Camera, track
+from dynmap_rl.data.camera import FrameSource, track
 from dynmap_rl.data.format.frames import iterate_frames
 from dynmap_rl.data.format.reading import find_dataset, read_info
 from dynmap_rl.data.tracking import WIDEST
@@ -16,7 +16,7 @@ from .figures import plt, save_figure
 SHOWN = 8  # frames
 
 
-def plot_tracks(dataset: str | Path, view: Camera, episode: int, path: Path) -> None:
+def plot_tracks(dataset: str | Path, view: FrameSource, episode: int, path: Path) -> None:
     """Draw outline, centre and axis of every object on frames of one episode, at equal distances in time.
 
     A cross in the place of the centre says that the object was not found in the frame.

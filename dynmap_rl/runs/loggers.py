@@ -21,7 +21,7 @@ def check_logger(name: str | None) -> None:
     if name not in LOGGERS:
         raise ValueError(f"--logger must be one of {', '.join(LOGGERS)}, got {name!r}")
     if importlib.util.find_spec(name) is None:
-        raise ValueError(f"--logger {name} needs its package: pip install '.[{name}]'")
+        raise ValueError(f"--logger {name} needs its package: uv pip install -e '.[{name}]'")
 
 
 def log_metrics(folder: Path, step: int, logger: str | None = None, **metrics: float) -> None:

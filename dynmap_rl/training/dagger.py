@@ -1,4 +1,4 @@
-"""Corrections of a student by the expert: DAgger (Ross et al. 2011)."""
+"""Corrections of a policy by the expert: DAgger (Ross et al. 2011)."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ FIRST_SCENE = 1_000_000  # far from the scenes of demonstrations
 
 @torch.no_grad()
 def collect_corrections(actor: TensorDictModuleBase, task: str, seeds: list[int]) -> TensorDict:
-    """Let a student act in scenes, and record what the expert would have done in every state that it reaches.
+    """Let a policy act in scenes, and record what the expert would have done in every state that it reaches.
 
     Args:
-        actor: the student, such as :class:`dynmap_rl.modules.Actor`.
+        actor: the policy with its world model, such as :class:`dynmap_rl.modules.Actor`.
         task: name of the task.
         seeds: seeds of the scenes.
 
     Returns:
-        Episodes ``[E, 120]`` with ``pixels``, ``goal``, ``dynamics``, the student's ``action`` as executed,
+        Episodes ``[E, 120]`` with ``pixels``, ``goal``, ``dynamics``, the policy's ``action`` as executed,
         ``expert_action``, and ``failed`` bool ``[..., 1]``: steps after a failure, in which there is nothing to correct.
     """
     actor, device, count = actor.eval(), next(actor.parameters()).device, len(seeds)
@@ -77,7 +77,7 @@ def add_corrections(
     Args:
         features: training states so far.
         world_model: frozen world model of the states.
-        policy: the student.
+        policy: the policy that is corrected.
         task: name of the task, whose expert corrects.
         scenes: number of scenes.
         seed: chooses the scenes.

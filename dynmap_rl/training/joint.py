@@ -50,7 +50,8 @@ def train_jointly(
     Args:
         world_model: changed in place.
         policy: changed in place.
-        episodes: ``train`` and ``eval``, TensorDicts ``[E, T]``.
+        episodes: ``train`` and ``eval``, ``[E, T]`` with ``pixels`` uint8 ``[E, T, 3, S, cameras * S]``, ``action`` ``[E, T, A]``,
+            ``goal`` ``[E, T, G]`` and ``("dynamics", quantity)`` ``[E, T, D]`` (SI units) for each supervised quantity.
         folder: gets ``metrics.jsonl`` and the training state.
         settings: sizes, weights and learning rate; default :class:`JointTraining`.
         seed: seed of the windows.
@@ -91,7 +92,8 @@ def train_end_to_end(
     Args:
         world_model: changed in place; its decoders are not trained.
         policy: changed in place.
-        episodes: ``train`` and ``eval``, TensorDicts ``[E, T]``.
+        episodes: ``train`` and ``eval``, ``[E, T]`` with ``pixels`` uint8 ``[E, T, 3, S, cameras * S]``, ``action`` ``[E, T, A]``,
+            ``goal`` ``[E, T, G]`` and ``("dynamics", quantity)`` ``[E, T, D]`` (SI units) for each supervised quantity.
         folder: gets ``metrics.jsonl`` and the training state.
         settings: sizes and learning rate; default :class:`EndToEndTraining`.
         seed: seed of the windows.

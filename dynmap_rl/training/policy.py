@@ -35,7 +35,7 @@ def train_policy(
         policy: changed in place.
         features: training states ``[E, T]`` of :func:`dynmap_rl.data.compute_features`.
         held_out: held-out states, on which the plain L1 is logged.
-        folder: gets ``metrics.jsonl``.
+        folder: gets ``metrics.jsonl``, whose lines after ``done`` are removed: a folder of its own.
         settings: sizes and learning rate; default :class:`PolicyTraining`.
         seed: seed of the batches, and line of the progress bar.
         done: updates of an earlier training of this policy, after which the metrics go on.

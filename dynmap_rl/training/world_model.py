@@ -58,9 +58,11 @@ def train_world_model(
 
     Args:
         world_model: changed in place; its supervision and form are its own, not those of the settings.
-        episodes: ``train`` and ``eval``, TensorDicts ``[E, T]``.
+        episodes: ``train`` and ``eval``, ``[E, T]`` with ``pixels`` uint8 ``[E, T, 3, S, cameras * S]``, ``action`` ``[E, T, A]``,
+            ``goal`` ``[E, T, G]`` and ``("dynamics", quantity)`` ``[E, T, D]`` (SI units) for each supervised quantity.
         folder: run folder; gets ``metrics.jsonl`` and the training state.
-        settings: sizes, weights and learning rate; default :class:`WorldModelTraining`.
+        settings: sizes, weights and learning rate; default :class:`WorldModelTraining`, whose augmentation is for tasks of cart
+            and block: for others, and for robot datasets, set it to ``Augmentation.off()``.
         logger: ``tensorboard``, ``wandb``, ``trackio`` or None.
         by_entry: log held-out errors for every entry of the dynamics, as robot datasets need.
         save_every: updates between training states.

@@ -13,7 +13,7 @@ def check_launcher(launcher: str) -> None:
     if launcher not in LAUNCHERS:
         raise ValueError(f"launcher must be one of {', '.join(LAUNCHERS)}, got {launcher!r}")
     if launcher == "ray" and find_spec("ray") is None:
-        raise ValueError("launcher ray needs Ray: pip install '.[ray]'")
+        raise ValueError("launcher ray needs Ray: uv pip install -e '.[ray]'")
 
 
 def connect() -> None:

@@ -8,7 +8,7 @@
 A run is one of another recipe for one task, method and seed, and its result a JSON file; runs with a result are skipped.
 The same command resumes a stopped grid and its runs. Three rows have dynamics that are derived from the recordings, in
 datasets/TASK_hand, _tracks and _color. The page has success, failures by cause, and animations. Needs
-pip install '.[lerobot,mujoco]'.
+uv pip install -e '.[lerobot,mujoco]'.
 """
 
 import json

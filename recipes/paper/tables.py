@@ -4,7 +4,7 @@
     python recipes/paper/tables.py --results runs/results     # a grid of your own
     python recipes/paper/tables.py --table II,III             # runs of some tables
     python recipes/paper/tables.py --only balance_reaching_decoupled_position --workers 2
-    python recipes/paper/tables.py --launcher ray             # on a Ray cluster (pip install '.[ray]')
+    python recipes/paper/tables.py --launcher ray             # on a Ray cluster (uv pip install -e '.[ray]')
     python recipes/paper/tables.py --print markdown           # tables from the results alone; or json, findings
     python recipes/paper/tables.py --write                    # recipes/results/README.md from the results alone
 
@@ -111,7 +111,7 @@ def choose_runs(config: Config) -> tuple[list[Run], list[Run]]:
         raise ValueError(
             f"--only must be a part of a run's name, got {config.only!r}; --dry_run lists the names"
         )
-    todo = {run.name: run.source for run in chosen if not is_done(run.name, config.results)}
+    todo = {run.name: run.needed_run for run in chosen if not is_done(run.name, config.results)}
     needed = {source for source in todo.values() if source and not has_run(source, config.runs)}
     return chosen, [run for run in runs if run.name in todo or run.name in needed]
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from films import film, make_poses
 
-from dynmap_rl.data.camera import Camera, measure
+from dynmap_rl.data.camera import FrameSource, measure
 from dynmap_rl.data.flow import flow_velocity
 from dynmap_rl.data.tracking import track_objects
 
@@ -22,7 +22,7 @@ def frames():
     ],
 )
 def test_the_unit_is_that_of_the_camera(frames, width, scale, origin):
-    tracks, flow = track_objects(frames, 2), Camera("flow", "front", 2, width=width)
+    tracks, flow = track_objects(frames, 2), FrameSource("flow", "front", 2, width=width)
     motion = measure(frames, 2.0, flow, fps=20)
     np.testing.assert_allclose(motion.position, (tracks.pose * scale + origin).reshape(10, 6))
     np.testing.assert_allclose(

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from dynmap_rl.data.camera import Motion
 from dynmap_rl.data.derive import _derive, differentiate
+from dynmap_rl.data.motion import Motion
 
 EVEN = np.arange(20) / 25
 UNEVEN = np.cumsum(np.random.default_rng(0).uniform(0.02, 0.08, 20))

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from dynmap_rl.data.demonstrations import load_dataset, load_meta
-from dynmap_rl.data.recording.plans import Plan, mark_pushes, plan_demonstrations, push, roll_out
+from dynmap_rl.data.recording.plans import Plan, mark_pushes, plan_demonstrations, push, run_plans
 from dynmap_rl.data.recording.record import record_dataset
 from dynmap_rl.envs.tasks import TASKS, get_task
 from dynmap_rl.envs.world import CONTROL_DT
@@ -33,7 +33,7 @@ def test_round_trip_is_exact(dataset):
     assert episodes.shape == (len(meta["episodes"]), 120)
     plans = [plan_of(row) for row in meta["episodes"]]
     assert torch.equal(episodes["disturbed"], mark_pushes(plans)) and episodes["disturbed"].any()
-    truth, shard = roll_out(meta["task"], plans[2:4], meta["expert"]), slice(2, 4)
+    truth, shard = run_plans(meta["task"], plans[2:4], meta["expert"]), slice(2, 4)
     keys = ["pixels", "agent_pos", "goal", "action", *(("dynamics", name) for name in DYNAMICS)]
     for key in [*keys, *(("next", name) for name in ("reward", "done", "is_success"))]:
         assert episodes[shard][key].dtype == truth[key].dtype
@@ -81,7 +81,7 @@ def test_the_expert_s_actions_are_those_that_the_cart_could_execute(monkeypatch)
         "dynmap_rl.data.recording.plans._expert_acceleration", lambda *_: np.array([[9.0, 0, 0]])
     )
     plan = Plan(3, list_checkpoints("balance_reaching")[-1])
-    episode = roll_out("balance_reaching", [plan])
+    episode = run_plans("balance_reaching", [plan])
     assert torch.equal(episode["expert_action"], episode["action"])
 
 
@@ -139,7 +139,7 @@ def test_expert_of_a_folder_is_recorded(tmp_path):
     assert meta["expert"] == str(expert)
     assert {row["checkpoint"] for row in meta["episodes"]} == {"mine"}
     plans = [plan_of({**row, "checkpoint": shipped}) for row in meta["episodes"][:2]]
-    assert torch.equal(load_dataset(root, "train")["action"], roll_out("bin_dropping", plans)["action"])
+    assert torch.equal(load_dataset(root, "train")["action"], run_plans("bin_dropping", plans)["action"])
     assert record_dataset(root, "bin_dropping", **small, expert=str(expert)) == root
     with pytest.raises(ValueError, match=f"expert {expert} instead of bin_dropping"):
         record_dataset(root, "bin_dropping", **small)

@@ -7,9 +7,10 @@ import pytest
 from films import film, make_poses
 from robot_dataset import make_robot_dataset
 
-from dynmap_rl.data.camera import Camera, Motion, measure, read_motion
+from dynmap_rl.data.camera import FrameSource, measure, read_motion
 from dynmap_rl.data.derive import differentiate
 from dynmap_rl.data.format.reading import read_info
+from dynmap_rl.data.motion import Motion
 from dynmap_rl.data.quality import LIMITS, Derived, judge_quality, quality_text, worst_episode
 
 NAMES = ["low_x", "low_y", "low_theta", "high_x", "high_y", "high_theta"]
@@ -17,7 +18,7 @@ POSES = make_poses(120)
 
 
 def judge(frames, objects=2):
-    motion = measure(frames, 1.0, Camera("tracks", "front", objects), 20)
+    motion = measure(frames, 1.0, FrameSource("tracks", "front", objects), 20)
     velocity, _ = differentiate(motion.position, np.arange(len(frames)) / 20, "savgol")
     return judge_quality([Derived(7, NAMES[: 3 * objects], motion.position, velocity, motion)])
 
@@ -112,7 +113,7 @@ def test_a_position_that_moves_far_in_every_step_does_not_jump():
 
 def test_the_flow_of_every_object_is_compared_with_its_own_velocity():
     velocity = np.gradient(POSES.reshape(120, 6), axis=0)
-    motion = measure(film(POSES), 1.0, Camera("tracks", "front", 2), 20)
+    motion = measure(film(POSES), 1.0, FrameSource("tracks", "front", 2), 20)
     motion = replace(motion, other=velocity * [1, 1, 1, -1, -1, 1])
     quality = judge_quality([Derived(7, NAMES, motion.position, velocity, motion)])
     check = quality["checks"]["agreement"]
@@ -154,7 +155,7 @@ def test_noise_of_positions_is_measured():
 
 def test_the_worst_episode_is_named_and_a_dataset_is_judged(tmp_path):
     root = make_robot_dataset(tmp_path / "robot")
-    camera = Camera("tracks", "observation.images.top", 1)
+    camera = FrameSource("tracks", "observation.images.top", 1)
     episodes = []
     for episode, motion in read_motion(root, read_info(root), camera):
         position = motion.position.copy()

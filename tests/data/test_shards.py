@@ -45,7 +45,7 @@ def test_metadata_tells_how_every_episode_was_made(recordings, name):
 def test_failures_are_replaced_by_the_next_candidates(tmp_path, monkeypatch):
     rolled = []
 
-    def roll_out(task, plans, expert):
+    def run_plans(task, plans, expert):
         assert (task, expert) == ("balance_reaching", "bin_dropping")
         rolled.append([plan.scene_seed for plan in plans])
         success = torch.tensor([plan.scene_seed % 3 == 0 for plan in plans])
@@ -53,11 +53,11 @@ def test_failures_are_replaced_by_the_next_candidates(tmp_path, monkeypatch):
         flags[:, -1, 0] = success
         return TensorDict({("next", "is_success"): flags}, [len(plans), 120])
 
-    monkeypatch.setattr(module, "roll_out", roll_out)
+    monkeypatch.setattr(module, "run_plans", run_plans)
     names = {"task": "balance_reaching", "expert": "bin_dropping", "kind": "demonstrations", "split": "train"}
     shard = module.Shard(tmp_path, **names, number=2, count=5)
     checkpoints = list_checkpoints("bin_dropping")
-    plans, episodes = module._roll_out_shard(shard)
+    plans, episodes = module._run_shard(shard)
     assert [plan.scene_seed for plan in plans] == [501, 504, 507, 510, 513]
     assert [plan.checkpoint for plan in plans] == [
         checkpoints[i // 3 % len(checkpoints)] for i in (501, 504, 507, 510, 513)
@@ -70,7 +70,7 @@ def test_failures_are_replaced_by_the_next_candidates(tmp_path, monkeypatch):
             module, "get_task", lambda name, scripted=scripted: SimpleNamespace(has_demonstrator=scripted)
         )
         with pytest.raises(ValueError, match=advice):
-            module._roll_out_shard(shard)
+            module._run_shard(shard)
 
 
 def test_constants_are_those_of_the_training_episodes(tmp_path, monkeypatch):

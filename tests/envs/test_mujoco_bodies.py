@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-mujoco = pytest.importorskip("mujoco", reason="pip install '.[mujoco]'")
+mujoco = pytest.importorskip("mujoco", reason="uv pip install -e '.[mujoco]'")
 
 from dynmap_rl.envs.mujoco.bodies import Body, BodyReader  # noqa: E402
 

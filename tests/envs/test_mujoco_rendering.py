@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from own_task import check_renderer
 
-mujoco = pytest.importorskip("mujoco", reason="pip install '.[mujoco]'")
+mujoco = pytest.importorskip("mujoco", reason="uv pip install -e '.[mujoco]'")
 
 from dynmap_rl.envs.mujoco import rendering  # noqa: E402
 from dynmap_rl.envs.mujoco.rendering import Camera, FrameRenderer, find_heavy, find_parts  # noqa: E402

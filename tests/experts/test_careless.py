@@ -9,7 +9,7 @@ from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.world import ACCELERATION_LIMIT
 from dynmap_rl.evaluation.experts import list_outcomes
 from dynmap_rl.experts.careless import CarelessController
-from dynmap_rl.experts.network import roll_out
+from dynmap_rl.experts.network import play_to_end
 
 TASKS = "balance_reaching", "balance_reaching_obstacle", "bin_dropping"
 
@@ -25,7 +25,7 @@ class WhiteNoise(nn.Module):
 
 def share_dropped(network, name, count=40):
     task = get_task(name)
-    dropped = list_outcomes(task, roll_out(network, task, scene_seeds("validation", count)))["dropped"]
+    dropped = list_outcomes(task, play_to_end(network, task, scene_seeds("validation", count)))["dropped"]
     return sum(dropped) / count
 
 
@@ -42,5 +42,5 @@ def test_white_noise_drops_nearly_all_blocks(name):
 
 def test_the_careless_controller_goes_to_the_goal_and_stays():
     task = get_task("balance_reaching")
-    worlds = roll_out(CarelessController(task), task, scene_seeds("validation", 10))
+    worlds = play_to_end(CarelessController(task), task, scene_seeds("validation", 10))
     assert max(world.position_error for world in worlds) < 0.05  # m

@@ -20,7 +20,7 @@ from dynmap_rl.experts.network import (
     list_checkpoints,
     load_expert,
     make_actor,
-    roll_out,
+    play_to_end,
     task_of_expert,
 )
 from dynmap_rl.reporting.media import film
@@ -34,7 +34,7 @@ SHIPPED = sorted((path.parent.name, path.stem) for path in CHECKPOINTS.glob("*/*
 @pytest.mark.parametrize("task", TASKS)
 def test_last_checkpoint_succeeds_on_fresh_scenes(task):
     seeds = [scene_seed("exploration", 20_000_000 + i) for i in range(40)]
-    worlds = roll_out(load_expert(task), get_task(task), seeds)
+    worlds = play_to_end(load_expert(task), get_task(task), seeds)
     assert sum(get_task(task).is_success(world) for world in worlds) >= 37
 
 
@@ -44,7 +44,7 @@ def test_last_checkpoint_succeeds_on_fresh_scenes(task):
 def test_rollout_is_that_of_the_environment(task):
     """Also past the end of an episode that is over early."""
     seeds, network = [scene_seed("exploration", i) for i in range(4)], load_expert(task)
-    worlds = roll_out(network, get_task(task), seeds)
+    worlds = play_to_end(network, get_task(task), seeds)
     env = DynmapBatchedEnv(task, num_envs=4, control="acceleration")
     policy = TensorDictModule(network, in_keys=["state"], out_keys=["action", "scale"])
     td = env.reset(TensorDict({"scene_seed": torch.tensor(seeds)}, [4]))

@@ -12,7 +12,7 @@ from dynmap_rl.integrations.onnx import PARTS, OnnxActor, export_to_onnx
 from dynmap_rl.modules.checkpoints import make_policy, make_world_model, save_policy, save_world_model
 from dynmap_rl.runs.lookup import load_actor
 
-REASON = "needs the extra onnx: pip install 'dynmap_rl[onnx]'"
+REASON = "needs the extra onnx: uv pip install -e '.[onnx]'"
 
 
 @pytest.fixture(scope="module")

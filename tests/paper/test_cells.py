@@ -40,7 +40,7 @@ def test_needed_world_models_are_trained_first_and_are_of_the_same_seed():
     names = [run.name for run in RUNS]
     for number, run in enumerate(RUNS):
         if run.needs:
-            source = BY_NAME[run.source]
+            source = BY_NAME[run.needed_run]
             assert names.index(source.name) < number and source.needs is None
             seed = run.name.partition("_world_model_")[2]
             joint = source.recipe in ("joint", "end_to_end")

@@ -131,7 +131,7 @@ def test_launchers_are_checked(monkeypatch):
     with pytest.raises(ValueError, match="got 'slurm'"):
         launch(RUNS, fail_at_b, "slurm")
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(ValueError, match=r"pip install '\.\[ray\]'"):
+    with pytest.raises(ValueError, match=r"pip install -e '\.\[ray\]'"):
         launch(RUNS, fail_at_b, "ray")
 
 

@@ -44,7 +44,7 @@ def test_a_table_is_chosen_with_the_world_models_that_it_needs(tmp_path):
         found, said = listed(tmp_path, "--table", table)
         runs = {name for name, run in by_name.items() if run.table == table}
         assert {by_name[name].task for name in runs} == {task}
-        assert found == runs | ({by_name[name].source for name in runs} - {None})
+        assert found == runs | ({by_name[name].needed_run for name in runs} - {None})
         assert f"about {sum(by_name[name].minutes for name in found) / 60:.1f} hours" in said
     assert listed(tmp_path)[0] == set(by_name)
     assert listed(tmp_path, "--table", "II,III", "--only", "joint_none")[0] == set(ALL)

@@ -35,7 +35,7 @@ def write(run, recording, frozen="one", compare=None):
     return write_report(
         folder, model, make_episodes()["eval"], [0, 1],
         task="balance_reaching", dataset=recording, policy="feedforward",
-        source={"task": "balance_reaching", "training": "decoupled"},
+        origin={"task": "balance_reaching", "training": "decoupled"},
         settings={"world_model": {"seed": 3}}, command="python x.py", frozen=frozen, compare=compare,
     )  # fmt: skip
 

@@ -125,5 +125,5 @@ def test_a_logger_that_is_unknown_or_not_installed_is_refused_before_anything_is
     for recipe in ("decoupled", "expert"):
         result = run(tmp_path, recipe, "--logger", "wandb")
         assert result.returncode == 2 and result.stderr.count("\n") == 1
-        assert "pip install '.[wandb]'" in result.stderr
+        assert "uv pip install -e '.[wandb]'" in result.stderr
     assert not any(tmp_path.iterdir())

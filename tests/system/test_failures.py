@@ -308,10 +308,10 @@ def test_no_display(place):
         (
             "ray",
             "tables --launcher ray --only joint_none --results results",
-            r"pip install '\.\[ray\]'",
+            r"pip install -e '\.\[ray\]'",
         ),
-        ("ray", "joint --compute.launcher ray --compute.ranks 2", r"pip install '\.\[ray\]'"),
-        ("dynmap_rl.integrations.lerobot", "evaluate --policy datasets", r"pip install '\.\[lerobot\]'"),
+        ("ray", "joint --compute.launcher ray --compute.ranks 2", r"pip install -e '\.\[ray\]'"),
+        ("dynmap_rl.integrations.lerobot", "evaluate --policy datasets", r"pip install -e '\.\[lerobot\]'"),
     ],
 )
 def test_an_extra_that_is_not_installed(place, monkeypatch, module, command, message):

@@ -7,7 +7,7 @@ from small import CONSTANTS, judge, make_episodes, make_model
 from tensordict.nn import TensorDictModule
 
 from dynmap_rl.data.features import compute_features
-from dynmap_rl.data.recording.plans import Plan, roll_out
+from dynmap_rl.data.recording.plans import Plan, run_plans
 from dynmap_rl.envs.scene import scene_seed
 from dynmap_rl.envs.world import LARGEST_CHANGE
 from dynmap_rl.experts.network import list_checkpoints
@@ -36,7 +36,7 @@ def student(actions):
 
 def test_a_student_that_acts_like_the_expert_is_not_corrected():
     seeds, checkpoint = [scene_seed("train", i) for i in (5, 6)], list_checkpoints("balance_reaching")[-1]
-    truth = roll_out("balance_reaching", [Plan(seed, checkpoint) for seed in seeds])
+    truth = run_plans("balance_reaching", [Plan(seed, checkpoint) for seed in seeds])
     corrected = collect_corrections(student(truth["action"]), "balance_reaching", seeds)
     assert corrected.shape == (2, 120)
     for key in ("pixels", "goal", "action", "expert_action", ("dynamics", "velocity")):

@@ -85,7 +85,7 @@ def test_labelled_episodes_are_whole_seeded_and_nested():
     assert all((large | ~small).all() for small, large in pairwise(draws))
     assert not torch.equal(draws[1], choose_labelled(episodes, 0.25, 4))
     pieces = torch.cat([episodes, episodes]).set(
-        "episode", torch.arange(20).repeat(2)[:, None, None].expand(40, 12, 1)
+        "episode", torch.arange(20).repeat(2)[:, None].expand(40, 12)
     )
     draw = choose_labelled(pieces, 0.25, 3)
     assert torch.equal(draw[:20], draw[20:]) and int(draw[:20, 0].sum()) == 5

@@ -47,7 +47,7 @@ def write_episodes(folder: Path, episodes: TensorDict, instruction: str, layout:
 
     Args:
         folder: folder of the dataset, which must not exist.
-        episodes: ``[E, T]`` with the entries of :func:`dynmap_rl.data.recording.plans.roll_out` and ``disturbed`` bool
+        episodes: ``[E, T]`` with the entries of :func:`dynmap_rl.data.recording.plans.run_plans` and ``disturbed`` bool
             ``[E, T, 1]``.
         instruction: the task in one sentence.
         layout: sizes and names of the task.

@@ -24,7 +24,7 @@ def keep_episode(root: str | Path, task: str, episode: TensorDict, scene_seed: i
     Args:
         root: folder of the dataset.
         task: name of the task.
-        episode: ``[1, T]`` (see :func:`dynmap_rl.data.recording.plans.roll_out`).
+        episode: ``[1, T]`` (see :func:`dynmap_rl.data.recording.plans.run_plans`).
         scene_seed: seed of its scene.
 
     Returns:

@@ -64,7 +64,7 @@ def plan_demonstrations(
 ) -> list[Plan]:
     """Plan demonstrations with the checkpoints in turn; two of three episodes have noise, one of three pushes too.
 
-    Noise and pushes lead to states from which the expert must recover, as a student will have to.
+    Noise and pushes lead to states from which the expert must recover, as a policy will have to.
 
     Args:
         task: name of the task.
@@ -125,7 +125,7 @@ def find_checkpoints(task: str, expert: str | Path | None = None) -> list[str]:
     return [SCRIPTED]
 
 
-def roll_out(task: str, plans: list[Plan], expert: str | Path | None = None) -> TensorDict:
+def run_plans(task: str, plans: list[Plan], expert: str | Path | None = None) -> TensorDict:
     """Run the plans as one batch.
 
     Args:
@@ -174,7 +174,7 @@ def demonstrate(task: str, plans: list[Plan]) -> TensorDict:
         plans: one plan for each episode.
 
     Returns:
-        ``[E, T]``, as :func:`roll_out` returns them.
+        ``[E, T]``, as :func:`run_plans` returns them.
     """
     rules, episodes = get_task(task), []
     draw, world = _open_simulator(task, type(rules))

@@ -19,7 +19,7 @@ from dynmap_rl.utils.files import read_json, write_json
 from ..demonstrations import FORMAT, META
 from ..format.writing import merge_datasets, write_episodes
 from ..normalization import layout_constants, normalization_constants
-from .plans import Plan, mark_pushes, plan_demonstrations, plan_exploration, roll_out
+from .plans import Plan, mark_pushes, plan_demonstrations, plan_exploration, run_plans
 
 ROWS = "episodes.json"  # metadata of a shard's episodes
 CANDIDATES_PER_SHARD = 250  # scenes of a shard, which keeps the first that succeed
@@ -59,7 +59,7 @@ def record_shard(shard: Shard) -> None:
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # processes share the cores, and a sum's last bit may depend on the threads
     try:
-        plans, episodes = _roll_out_shard(shard)
+        plans, episodes = _run_shard(shard)
     finally:
         torch.set_num_threads(threads)
     write_shard(shard.folder, shard.task, plans, episodes)
@@ -72,7 +72,7 @@ def write_shard(folder: Path, task: str, plans: list[Plan], episodes: TensorDict
         folder: folder of the shard.
         task: name of the task.
         plans: one plan for each episode.
-        episodes: ``[E, T]`` (see :func:`dynmap_rl.data.recording.plans.roll_out`).
+        episodes: ``[E, T]`` (see :func:`dynmap_rl.data.recording.plans.run_plans`).
 
     Raises:
         OSError: the folder does not hold what was written.
@@ -134,7 +134,7 @@ def merge_shards(shards: list[Shard], folder: Path, settings: dict) -> None:
     write_json(folder / META, meta)
 
 
-def _roll_out_shard(shard: Shard) -> tuple[list[Plan], TensorDict]:
+def _run_shard(shard: Shard) -> tuple[list[Plan], TensorDict]:
     """Return the first ``count`` candidates that succeed, or simply the first of an exploration."""
     plans, kept, missing, start = [], [], shard.count, 0
     one_by_one = get_task(shard.task).has_demonstrator  # no batch, in which some more take hardly longer
@@ -150,7 +150,7 @@ def _roll_out_shard(shard: Shard) -> tuple[list[Plan], TensorDict]:
                 f"{shard.count} of {start} candidates of {shard.task} must succeed, got {len(plans)}; {better}"
             )
         candidates = _plan(shard, shard.number * CANDIDATES_PER_SHARD + start, size)
-        episodes = roll_out(shard.task, candidates, shard.expert)
+        episodes = run_plans(shard.task, candidates, shard.expert)
         good = episodes["next", "is_success"][:, -1, 0] | (shard.kind == "exploration")
         chosen = good.nonzero()[:missing, 0]
         plans += [candidates[i] for i in chosen.tolist()]

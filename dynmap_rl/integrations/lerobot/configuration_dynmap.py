@@ -20,7 +20,7 @@ GOAL = 2  # entries of the goal, x and y
 class DynmapConfig(PreTrainedConfig):
     """Settings of ``--policy.type=dynmap``: world model and policy, trained jointly (paper, Eq. 4 and 5).
 
-    The defaults are those of ``recipes/joint.py``, with LeRobot's batch size of 8.
+    Weights, sizes and learning rate are those of ``recipes/joint.py``, with LeRobot's batch size of 8.
 
     Attributes:
         supervision: dynamics that the world model predicts: any of ``position,velocity,acceleration``, or ``none``
@@ -28,7 +28,7 @@ class DynmapConfig(PreTrainedConfig):
         kind: ``recurrent`` or ``feedforward`` policy.
         latent_size: Z of the world model.
         hidden_size: H of the world model.
-        architecture: ``glimpse`` or ``plain`` (see :class:`dynmap_rl.modules.WorldModel`).
+        architecture: ``glimpse``, ``plain``, ``resnet18`` or ``vit`` (see :class:`dynmap_rl.modules.WorldModel`).
         width: width of the policy; 0 for its default.
         window_steps: steps of a training window.
         rgb_frames: decoded frames of a batch.
