@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from dynmap_rl.evaluation.failures import CAUSES, failure_causes
@@ -12,7 +13,8 @@ from dynmap_rl.reporting.figures import plt, save_figure
 from dynmap_rl.runs.lookup import load_actor
 from dynmap_rl.utils.files import read_json
 
-from .cells import TASKS
+from .cells import TASKS, Key
+from .results import Cell
 from .tables import cause_table
 
 _DECOUPLED = [
@@ -83,16 +85,27 @@ def plot_failures(failures: list[dict], path: Path) -> None:
     save_figure(figure, path)
 
 
-def markdown_failures(failures: list[dict]) -> str:
+def markdown_failures(failures: list[dict], cells: Mapping[Key, Cell]) -> str:
     """Return a table of the shares of failed episodes (%) by cause.
 
     Args:
         failures: results of :func:`find_failures`.
+        cells: result of :func:`dynmap_rl.paper.results.read_cells`. Those with failures, except ablations, have a row of
+            the results that name causes, over all of their policies.
     """
-    return cause_table(
-        (_title(one), one["episodes"], {cause: len(scenes) for cause, scenes in one["scenes"].items()})
+    lines = [
+        (f"{_title(one)}, first policy", one["episodes"], {c: len(s) for c, s in one["scenes"].items()})
         for one in failures
-    )
+    ]
+    for (task, training, policy, row), cell in cells.items():
+        if cell.table == "ablations":
+            continue
+        named = [r for r in cell.results if all("causes" in seed["test"]["rows"] for seed in r["results"])]
+        episodes = [episode for result in named for rows in result_rows(result) for episode in rows]
+        if counts := Counter(episode["cause"] for episode in episodes if "cause" in episode):
+            facts = {"task": task, "training": training, "policy": policy, "row": row, "runs": named}
+            lines.append((f"{_title(facts)}, all policies", len(episodes), counts))
+    return cause_table(lines)
 
 
 def _causes(failures: list[dict]) -> list[str]:

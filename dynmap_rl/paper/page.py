@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Mapping
 from pathlib import Path
 
 from dynmap_rl.utils.files import read_json, write_bytes
 
-from .cells import TABLES, TASKS
+from .cells import TABLES, TASKS, Key
 from .failures import markdown_failures
 from .findings import compare_cells, markdown_claims, markdown_comparisons, markdown_transfer
 from .published import METRICS
-from .results import COLUMNS, read_cells
+from .results import COLUMNS, Cell, read_cells
 from .tables import OWN, join_table, markdown_column, markdown_overview, markdown_own
 
 UNITS = {"DR": "%", "PE": "mm"}
@@ -110,9 +111,9 @@ policy; 95 % interval over scenes); and on held-out demonstrations, what stands 
 
 ## What fails
 
-Failed episodes of the first policy of as many world models as the row says, run again
-(`python recipes/paper/figures.py --only failures`). A drop is named after the place and the cart's speed when the block began
-to tip; the causes are defined in [failures.py](../../dynmap_rl/evaluation/failures.py).
+Failed episodes of all policies of as many world models as the row says; or, where results do not name causes, of the first
+policies, run again (`python recipes/paper/figures.py --only failures`). A drop is named after the place and the cart's speed
+when the block began to tip; the causes are defined in [failures.py](../../dynmap_rl/evaluation/failures.py).
 
 {failures}
 
@@ -160,7 +161,7 @@ def markdown_page(results: Path) -> str:
         columns="\n\n".join(columns),
         own="\n\n".join(f"### {what}\n\n{markdown_own(cells, table)}" for table, what in OWN.items()),
         ablations=markdown_ablations(read_json(results / "measurements" / "ablations.json")),
-        failures=_failures(results / "measurements" / "failures.json"),
+        failures=_failures(results / "measurements" / "failures.json", cells),
         perception=markdown_perception(read_json(results / "measurements" / "probe.json")),
         media="\n\n".join(f"![{text}](media/{name})\n\n{text}" for name, text in contents["media"].items()),
         measurements=_measurements(results / "measurements", contents["measurements"]),
@@ -269,8 +270,8 @@ def write_results_page(results: Path, readme: Path) -> list[Path]:
     return changed
 
 
-def _failures(path: Path) -> str:
-    return markdown_failures(read_json(path)["failures"]) if path.exists() else "Not measured yet."
+def _failures(path: Path, cells: Mapping[Key, Cell]) -> str:
+    return markdown_failures(read_json(path)["failures"] if path.exists() else [], cells)
 
 
 def _measurements(folder: Path, contents: dict[str, dict]) -> str:

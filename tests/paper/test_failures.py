@@ -3,14 +3,15 @@
 import matplotlib.pyplot as plt
 import pytest
 import torch
-from made_up import make_rows
+from made_up import make_rows, write
 
 from dynmap_rl.envs.scene import scene_seeds
 from dynmap_rl.evaluation.failures import CAUSES
 from dynmap_rl.modules.checkpoints import make_policy, make_world_model, save_policy, save_world_model
 from dynmap_rl.paper import failures
-from dynmap_rl.paper.cells import list_runs
+from dynmap_rl.paper.cells import TABLES, list_runs
 from dynmap_rl.paper.failures import CELLS, REPEATED, find_failures, markdown_failures, plot_failures
+from dynmap_rl.paper.results import read_cells
 from dynmap_rl.utils.files import write_json
 
 ONE = {
@@ -56,14 +57,25 @@ def test_failed_episodes_alone_are_run_again(recording, tmp_path):
 
 
 def test_a_row_has_the_shares_of_its_causes():
-    lines = markdown_failures(FAILURES).splitlines()
+    lines = markdown_failures(FAILURES, {}).splitlines()
     assert (
         lines[0] == "| % of the episodes | fail | drops at the goal | stops short | succeeds when repeated |"
     )
     assert (
-        lines[2] == "| balance_reaching: RGB+[P], decoupled, recurrent, 2 world models | 6.0 | 2.0 | 4.0 |  |"
+        lines[2]
+        == "| balance_reaching: RGB+[P], decoupled, recurrent, 2 world models, first policy | 6.0 | 2.0 | 4.0 |  |"
     )
     assert lines[3].endswith("| 2.0 |  |  | 2.0 |") and lines[4].endswith("| 0.0 |  |  |  |")
+
+
+def test_results_that_name_causes_have_a_row(tmp_path):
+    write(tmp_path, "RGB+[V]", 30, 20, causes={"stops short": [30, 31], "overshoots": [39]})
+    write(tmp_path, "RGB+[P]", 20, 20)
+    lines = markdown_failures(FAILURES[2:], read_cells(tmp_path, TABLES)).splitlines()
+    assert lines[0] == "| % of the episodes | fail | stops short | overshoots |"
+    assert lines[3:] == [
+        "| balance_reaching: RGB+[V], decoupled, recurrent, 2 world models, all policies | 7.5 | 5.0 | 2.5 |"
+    ]
 
 
 @pytest.mark.parametrize("given", [FAILURES, FAILURES[2:]])
