@@ -44,8 +44,7 @@ class Config:
     delay_error: int = 0
     # Act on the newest frame that has arrived as if it were of the present, for comparison.
     stale: bool = False
-    # Expert: the task that a shipped expert belongs to, a folder of checkpoints, or careless, a baseline that ignores the
-    # block; by default the task's own expert.
+    # Expert: task of a shipped expert, folder of checkpoints, or careless (ignores the block); by default the task's own.
     expert: str | None = None
     # Checkpoint of the expert; by default the last.
     checkpoint: str | None = None
@@ -74,7 +73,7 @@ def main(config: Config) -> None:
     else:
         names = ["seed", "trust_remote_code", "delay", "jitter", "lost", "delay_error", "stale"]
         refuse(config, Config(), names, "an expert")
-    torch.set_num_threads(config.compute.threads)
+    torch.set_num_threads(1)  # networks are small, and threads would wait for each other
     folder, text, result = (judge_policy if config.policy else judge_expert)(config)
     print(text)
     who = f"Policy {config.policy}" if config.policy else f"Expert {result['expert']}"
@@ -104,8 +103,7 @@ def judge_policy(config: Config) -> tuple[Path, str, dict]:
 
     delay, folder = read_delay(config), find_run(config.policy)
     task = config.task or task_of_run(folder) or "balance_reaching"
-    description = get_task(task, from_file=not config.task).description
-    actor = load_policy(config, folder, description)
+    actor = load_policy(config, folder, get_task(task, from_file=not config.task).description)
     if delay and not config.stale:
         if not isinstance(actor, Actor):
             raise ValueError("--policy must be a run for --delay; add --stale for a LeRobot policy")
@@ -135,6 +133,8 @@ def read_delay(config: Config):
 
 def load_policy(config: Config, folder: Path, instruction: str):
     """Load the actor of a run, or a LeRobot policy, which gets the task as an instruction."""
+    import torch
+
     from dynmap_rl.runs.lookup import has_world_model, load_actor
     from dynmap_rl.utils.devices import choose_device
 
@@ -144,8 +144,7 @@ def load_policy(config: Config, folder: Path, instruction: str):
         return load_actor(folder, config.seed).to(choose_device(config.compute.device))
     if not Path(config.policy).expanduser().exists() and not config.trust_remote_code:
         raise ValueError(
-            f"{config.policy} is a LeRobot policy on the hub, whose files may name code to run; add --trust_remote_code "
-            "if you trust its author"
+            f"{config.policy} on the hub may name code to run; add --trust_remote_code to allow it"
         )
     try:
         from dynmap_rl.integrations.lerobot import LeRobotActor
@@ -154,6 +153,7 @@ def load_policy(config: Config, folder: Path, instruction: str):
             f"--policy must be a run, got {config.policy}; LeRobot policies need uv pip install -e '.[lerobot]' ({error})"
         ) from error
     refuse(config, Config(), ["seed"], "a LeRobot policy")
+    torch.set_num_threads(config.compute.threads)
     return LeRobotActor(config.policy, instruction=instruction)
 
 

@@ -58,6 +58,8 @@ class Config:
 
 def main(config: Config) -> None:
     """Play, record and upload."""
+    import torch
+
     from dynmap_rl.data.format.hub import push_dataset
     from dynmap_rl.data.recording.human import list_shards, next_scene, open_folder, publish_episodes
     from dynmap_rl.envs.tasks import get_task
@@ -67,6 +69,7 @@ def main(config: Config) -> None:
     from dynmap_rl.runs.folder import plain_settings
     from dynmap_rl.runs.lookup import find_run, load_actor, task_of_run
 
+    torch.set_num_threads(1)  # networks are small, and threads would wait for each other
     run = find_run(config.policy) if config.policy else None
     task = config.task or (run and task_of_run(run)) or "balance_reaching"
     actor = load_actor(run, config.seed) if run else None
