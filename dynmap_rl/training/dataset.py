@@ -5,12 +5,18 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from dynmap_rl.data.demonstrations import META, find_layout, find_meta
-from dynmap_rl.data.format.reading import find_dataset
+from dynmap_rl.data.format.frames import iterate_frames
+from dynmap_rl.data.format.reading import find_dataset, read_column, read_info, read_table
 from dynmap_rl.data.recording.record import record_dataset
 from dynmap_rl.data.settings import Augmentation
 from dynmap_rl.envs.protocol import BaseTask
 from dynmap_rl.envs.tasks import get_task
+from dynmap_rl.keys import CAMERAS
+
+LEVEL = 5  # largest mean difference of two frames of 0..255, which other libraries draw slightly differently
 
 
 def find_or_record(task: str, dataset: str | Path | None = None) -> str | Path:
@@ -22,13 +28,15 @@ def find_or_record(task: str, dataset: str | Path | None = None) -> str | Path:
             missing.
 
     Raises:
-        ValueError: the dataset is of another task, or holds no demonstrations.
+        ValueError: the dataset is of another task, or of the same task with another camera, scene or goal, or holds no
+            demonstrations.
     """
     folder = Path("datasets") / get_task(task).name
     if dataset is None and not (folder / META).exists():
         return record_dataset(folder, task)
     dataset = folder if dataset is None else dataset
     check_dataset(dataset, task)
+    check_start(dataset, task)
     return dataset
 
 
@@ -64,3 +72,35 @@ def check_dataset(dataset: str | Path, task: str) -> None:
                 f"{dataset} was recorded with {name} {recorded[name]}, but {task} now has {own[name]}; delete the dataset "
                 "to record it again, or choose another --dataset"
             )
+
+
+def check_start(dataset: str | Path, task: str) -> None:
+    """Raise ``ValueError`` if a recording does not begin as the task does now, because its class has changed.
+
+    What a policy reads at the first step of the first episode is compared: ``agent_pos`` with the goal, and the frame. A
+    dataset without the seeds of its scenes is accepted unchecked.
+    """
+    root = find_dataset(dataset)
+    if (meta := find_meta(root)) is None:
+        return
+    info, rules = read_info(root), get_task(task)
+    views = [iterate_frames(root, info, f"{CAMERAS}{camera}") for camera in rules.layout.cameras]
+    first = [next(view) for view in views]
+    seeds = {row["episode_index"]: row.get("scene_seed") for row in meta["episodes"]}
+    if (seed := seeds.get(first[0][0])) is None:
+        return
+    world = rules.begin(seed)
+    columns = read_table(root, info, ["observation.state"])
+    recorded = read_column(root, info, columns, "observation.state")[
+        columns["episode_index"].to_numpy() == first[0][0]
+    ]
+    drawn, frame = rules.make_renderer()(world), np.concatenate([frames[0] for _, frames, _ in first], 1)
+    wrong = {
+        "state": not np.allclose(recorded[0], rules.agent_pos(world), atol=1e-3),
+        "frame": np.abs(frame.astype(float) - drawn).mean() > LEVEL,
+    }
+    for name in (name for name, found in wrong.items() if found):
+        raise ValueError(
+            f"the first {name} of {dataset} is not that of {task} now: its scene, goal or camera has changed; delete the "
+            "dataset to record it again, or choose another --dataset"
+        )

@@ -7,7 +7,7 @@ import pytest
 
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.training import dataset
-from dynmap_rl.training.dataset import check_dataset, find_or_record
+from dynmap_rl.training.dataset import check_dataset, check_start, find_or_record
 from dynmap_rl.utils.files import read_json, write_json
 
 TASK = "balance_reaching"
@@ -49,3 +49,22 @@ def test_a_dataset_of_other_cameras_is_refused(recording, tmp_path):
     write_json(path, read_json(path) | {"layout": layout})
     with pytest.raises(ValueError, match="cameras.*side.*front"):
         check_dataset(tmp_path / "recording", TASK)
+
+
+def test_a_recording_begins_as_the_task_does_now(recording, tmp_path, monkeypatch):
+    check_start(recording, TASK)
+    shutil.copytree(recording, tmp_path / "recording")
+    path = tmp_path / "recording/meta/dynmap.json"
+    meta = read_json(path)
+    first, second = meta["episodes"][:2]
+    write_json(path, meta | {"episodes": [first | {"scene_seed": second["scene_seed"]}, second]})
+    with pytest.raises(ValueError, match="first state of .*recording"):
+        find_or_record(TASK, tmp_path / "recording")
+    unnamed = {key: value for key, value in first.items() if key != "scene_seed"}
+    write_json(path, meta | {"episodes": [unnamed, second]})
+    check_start(tmp_path / "recording", TASK)
+    task = get_task(TASK)
+    draw = task.make_renderer()
+    monkeypatch.setattr(type(task), "make_renderer", lambda self: lambda world: draw(world)[::-1])
+    with pytest.raises(ValueError, match="first frame of"):
+        check_start(recording, TASK)
