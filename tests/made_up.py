@@ -32,19 +32,23 @@ def write(
         training: training of the cell.
         policy: kind of the policies.
         task: task of the policies.
-        rows: other outcomes of the episodes, or ``commit``.
+        rows: other outcomes of the episodes; or ``commit``; or ``first``, the number of the first world model.
     """
-    commit = rows.pop("commit", "abc")
+    commit, first = rows.pop("commit", "abc"), rows.pop("first", 0)
     made = [make_rows(number, **rows) for number in successes]
     runs = runs_of((task, training, policy, row))
+    names = [f"{training} {row} {first + number}" for number in range(len(made))]
     if len(runs) == 1:  # a world model for each seed
-        results = [[{"test": {"rows": one}, "paper": {"rows": one}} for one in made]]
+        seeds = zip(made, names, strict=True)
+        results = [
+            [{"test": {"rows": one}, "paper": {"rows": one}, "world_model_sha256": n} for one, n in seeds]
+        ]
     else:
         results = [[{"test": {"rows": one}, "paper": {"rows": one}}] * 3 for one in made]
     folder.mkdir(parents=True, exist_ok=True)
     for number, (run, seeds) in enumerate(zip(runs, results, strict=False)):
         facts = {"task": task, "policy": policy, "row": row, "command": "python x.py", "commit": commit}
-        facts |= {"world_model_sha256": None if len(runs) == 1 else f"{row} {number}", "results": seeds}
+        facts |= {"world_model_sha256": None if len(runs) == 1 else names[number], "results": seeds}
         (folder / f"{run.name}.json").write_text(json.dumps(facts))
 
 

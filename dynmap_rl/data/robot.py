@@ -90,8 +90,7 @@ def load_robot_dataset(
         every quantity of the dynamics). Pieces are ``[P, T]``: ``pixels`` uint8 ``[P, T, 3, S, cameras * S]``, ``action``
         ``[P, T, A]``, ``goal`` ``[P, T, G]`` (G = 0 without a goal), ``("dynamics", quantity)`` ``[P, T, D]`` for the
         columns that the dataset has, float32 in its units, ``disturbed`` bool ``[P, T, 1]`` where the dataset has such a
-        column of flags, and ``episode`` int64
-        ``[P, T]``, the episode's index.
+        column of flags, and ``episode`` int64 ``[P, T]``, the episode's index.
 
     Raises:
         ValueError: the dataset is missing or damaged, or fewer than two episodes are long enough.

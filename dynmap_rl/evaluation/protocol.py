@@ -49,8 +49,8 @@ def evaluate(
 
     Returns:
         ``test`` on the shared scenes of ``settings.split``, whichever that is, and, if ``settings.paper_episodes`` is not 0,
-        ``paper`` on others. Each has
-        ``summary`` (see :func:`dynmap_rl.evaluation.summarize`) and ``rows`` (see :func:`pack_rows`).
+        ``paper`` on others. Each has ``summary`` (see :func:`dynmap_rl.evaluation.summarize`) and ``rows`` (see
+        :func:`pack_rows`).
 
     Raises:
         ValueError: the actor cannot be sent to other processes.

@@ -166,8 +166,8 @@ def outcome_gap(terms: Sequence[tuple[int, list[list[dict]]]], outcome: str = "s
 
     Returns:
         ``gap``, the sum of the means with their signs, in percentage points or mm; its 95 % ``interval`` over the start
-        states, after averaging over policy seeds; and ``p``, the two-sided probability of a gap of this size if none is
-        to be expected. Those of flags are by bootstrap, and exact over exchanges of the sign in every start state;
+        states, after averaging over policy seeds; and ``p``, the two-sided probability of a gap of this size if the
+        true gap is zero. Those of flags are by bootstrap, and exact over exchanges of the sign in every start state;
         those of ``position_error`` are by a t test.
 
     Raises:
@@ -181,9 +181,8 @@ def outcome_gap(terms: Sequence[tuple[int, list[list[dict]]]], outcome: str = "s
             "results must be on the same start states, got different scenes; evaluate them again"
         )
     flags = isinstance(terms[0][1][0][0][outcome], bool)
-    unit = math.lcm(
-        *(len(policies) for _, policies in terms)
-    )  # sums of flags are whole numbers, so that a tie is one
+    # Sums of flags are whole numbers, so that a tie is one.
+    unit = math.lcm(*(len(policies) for _, policies in terms))
     sums = sum(
         sign * (unit // len(policies)) * np.sum([[row[outcome] for row in rows] for rows in policies], axis=0)
         for sign, policies in terms

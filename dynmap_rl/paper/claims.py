@@ -91,19 +91,18 @@ def _dynamics() -> Iterator[Pair]:
 
 
 def _kinds_of_dynamics() -> Iterator[Pair]:
-    for form in ("", PLAIN):
-        group = "task 1, feed-forward" + form
-        cell = {row: (*FEEDFORWARD, row + form) for row in DYNAMICS_ROWS}
-        for other in ("RGB+[P]", "RGB+[A]"):
-            comparison = f"RGB+[V] - {other}"
+    columns = {
+        name + form: (column, form) for form in ("", PLAIN) for name, column in list(FIRST.items())[:2]
+    }
+    for group, (column, form) in columns.items():
+        p, v, a, p_v = ((*column, f"RGB+[{row}]{form}") for row in ("P", "V", "A", "P+V"))
+        for name, other in (("P", p), ("A", a)):
             yield from _better(
-                "Velocity is the best single quantity", group, comparison, cell["RGB+[V]"], cell[other]
+                "Velocity is the best single quantity", group, f"RGB+[V] - RGB+[{name}]", v, other
             )
-        for other in ("RGB+[P]", "RGB+[V]"):
-            comparison = f"RGB+[P+V] - {other}"
-            yield from _better(
-                "Position and velocity are better together", group, comparison, cell["RGB+[P+V]"], cell[other]
-            )
+        for name, other in (("P", p), ("V", v)):
+            claim = "Position and velocity are better together"
+            yield from _better(claim, group, f"RGB+[P+V] - RGB+[{name}]", p_v, other)
 
 
 def _policies() -> Iterator[Pair]:
@@ -138,7 +137,10 @@ def _transfers() -> Iterator[Pair]:
             if name == "task 3, joint":
                 yield Pair("Dynamics are worse than Only-RGB", name, row, *pair, "SR", -1)
             else:
-                yield Pair("Dynamics are better than Only-RGB", name, row, *pair)
+                metrics = "SR" if column[0] == THREE else "SR,DR"
+                yield from _better(
+                    "Dynamics are better than Only-RGB", name, row, *(*pair[0], *pair[1]), metrics
+                )
     for training in ("decoupled", "joint"):
         for row in ROWS:
             first, second, third = ((task, training, "recurrent", row) for task in TASKS)

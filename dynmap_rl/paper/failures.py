@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from dynmap_rl.evaluation.failures import CAUSES, failure_causes
@@ -101,9 +102,17 @@ def markdown_failures(failures: list[dict], cells: Mapping[Key, Cell]) -> str:
         if cell.table == "ablations":
             continue
         named = [r for r in cell.results if all("causes" in seed["test"]["rows"] for seed in r["results"])]
-        episodes = [episode for result in named for rows in result_rows(result) for episode in rows]
+        cell = replace(cell, results=tuple(named))
+        episodes = [episode for rows in cell.policies for episode in rows]
         if counts := Counter(episode["cause"] for episode in episodes if "cause" in episode):
-            facts = {"task": task, "training": training, "policy": policy, "row": row, "runs": named}
+            training = "end_to_end" if row == "End-to-End" else training
+            facts = {
+                "task": task,
+                "training": training,
+                "policy": policy,
+                "row": row,
+                "runs": cell.world_models,
+            }
             lines.append((f"{_title(facts)}, all policies", len(episodes), counts))
     return cause_table(lines)
 

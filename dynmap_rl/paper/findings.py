@@ -30,7 +30,7 @@ def compare_cells(cells: Mapping[Key, Cell]) -> list[dict]:
 
     Returns:
         Dicts with ``claim``, ``group``, ``comparison``, ``metric`` and ``sign`` of the pair; ``values`` of both sides and
-        their ``gap`` (points, or mm of PE) with its 95 % bootstrap ``interval`` over the shared start states; ``paper``,
+        their ``gap`` (points, or mm of PE) with its 95 % ``interval`` over the shared start states; ``paper``,
         the paper's gap; ``p`` (see :func:`dynmap_rl.evaluation.outcome_gap`); the 95 % interval of the gap over
         ``trainings`` (see :func:`gap_over_trainings`); the number of ``world_models`` of both sides; and ``verdict``.
         That is ``holds`` if p is below 0.05 and the interval over trainings is on the side that the claim says; ``does
@@ -48,8 +48,8 @@ def gap_over_trainings(
 ) -> tuple[float, float] | None:
     """Return the 95 % interval of the gap over world models, or None where their number says nothing.
 
-    It is paired where both sides have policies on the same frozen world models, as recurrent and feed-forward policies
-    of a row, or one policy on two tasks; otherwise Welch's.
+    It is paired where both sides have policies on the same world models and no others, as recurrent and feed-forward
+    policies of a row, or a row on two tasks; otherwise Welch's.
 
     Args:
         a: one cell, or two on the same frozen world models, of which the second is subtracted.
@@ -57,21 +57,17 @@ def gap_over_trainings(
         outcome: entry of the episodes' rows.
     """
     ours, theirs = _by_world_model(a, outcome), _by_world_model(b, outcome)
-    if shared := [name for name in ours if name in theirs]:
-        return paired_interval([ours[name] for name in shared], [theirs[name] for name in shared])
+    if set(ours) == set(theirs):
+        return paired_interval([*ours.values()], [theirs[name] for name in ours])
     return welch_interval([*ours.values()], [*theirs.values()])
 
 
-def _by_world_model(side: Sequence[Cell], outcome: str) -> dict[object, float]:
-    """Return the mean outcome of each world model (% or mm) by its fingerprint, or where it has none by a name of its own."""
-    found = []
-    for cell in side:
-        names = cell.fingerprints or [(cell.key, number) for number in range(len(cell.world_models))]
-        found.append(dict(zip(names, cell.rates(outcome), strict=True)))
-    if len(found) == 1:
-        return found[0]
-    first, second = found
-    return {name: rate - second[name] for name, rate in first.items() if name in second}
+def _by_world_model(side: Sequence[Cell], outcome: str) -> dict[str, float]:
+    """Return the mean outcome of each world model (% or mm) by its fingerprint; of two cells the difference."""
+    first, *rest = (dict(zip(cell.fingerprints, cell.rates(outcome), strict=True)) for cell in side)
+    for second in rest:
+        first = {name: rate - second[name] for name, rate in first.items() if name in second}
+    return first
 
 
 def _compare(pair: Pair, cells: Mapping[Key, Cell]) -> dict:
@@ -93,7 +89,7 @@ def _compare(pair: Pair, cells: Mapping[Key, Cell]) -> dict:
         "interval": found["interval"],
         "p": found["p"],
         "trainings": trainings,
-        "world_models": [min(len(cell.world_models) for cell in side) for side in (a, b)],
+        "world_models": [len(_by_world_model(side, outcome)) for side in (a, b)],
         "verdict": HOLDS if above else FAILED if below else OPEN,
     }
 
@@ -121,7 +117,7 @@ def markdown_claims(comparisons: list[dict]) -> str:
         unit = METRICS[part[2]][1].replace("%", "points")
         gaps = [_span(paper, 0), f"{_span([row['gap'] for row in own], 1)} {unit}"]
         lines.append([*part, *gaps, *counts, f"**{judge_claim(own)}**"])
-    head = ["claim", "comparisons", "of", "the paper's gaps", "gaps", *VERDICTS, "verdict"]
+    head = ["claim", "comparisons", "metric", "the paper's gaps", "gaps", *VERDICTS, "verdict"]
     rest = "".join(f"\n- {claim}: {'; '.join(groups)}" for claim, groups in missing.items())
     return join_table(head, lines) + (f"\n\nWithout runs so far:\n{rest}" if rest else "")
 
@@ -139,15 +135,15 @@ def markdown_comparisons(comparisons: list[dict]) -> str:
         comparisons: result of :func:`compare_cells`.
     """
     head = [
-        "",
-        "",
+        "comparison",
+        "metric",
         "values",
         "gap [scenes]",
         "p",
         "gap over world models",
         "world models",
         "the paper's gap",
-        "claim",
+        "verdict",
     ]
     parts = []
     for claim in dict.fromkeys(row["claim"] for row in comparisons):
@@ -157,12 +153,12 @@ def markdown_comparisons(comparisons: list[dict]) -> str:
 
 
 def _comparison_row(row: dict) -> list[str]:
-    low, high = row["interval"]
+    low, high = (round(end, 1) + 0.0 for end in row["interval"])  # no -0.0
     return [
         f"{row['group']}: {row['comparison']}",
         f"{row['metric']} {METRICS[row['metric']][1]}",
         ", ".join(f"{value:.1f}" for value in row["values"]),
-        f"{row['gap']:+.1f} [{low:.1f}, {high:.1f}]",
+        f"{round(row['gap'], 1) + 0.0:+.1f} [{low:.1f}, {high:.1f}]",
         p_text(row["p"]),
         "[{:.1f}, {:.1f}]".format(*row["trainings"]) if row["trainings"] else "-",
         ", ".join(map(str, row["world_models"])),

@@ -51,31 +51,31 @@ paper.
 
 ## The paper's claims
 
-Every claim of the paper's Sec. V on success, drops or position error is a set of comparisons of two cells, paired over the
+The claims of the paper's Sec. V on success, drops and position errors are sets of comparisons of two cells, paired over the
 1,000 scenes that both share. A gap is the difference of the two, in percentage points of SR or DR, or in mm of PE, with a
 95 % interval over the scenes and p, the probability of a gap of this size by chance
 ([how](../../dynmap_rl/evaluation/statistics.py)). Both say nothing about further trainings. The 95 % interval over world models
-does: paired where both cells are of the same frozen world models, otherwise Welch's. With three on either side it is wide.
-The paper's gaps are differences of its means over three policies.
+does: paired where both cells are of the same world models, otherwise Welch's. With three on either side it is wide. The paper's
+gaps are differences of its means over three policies.
 
 A comparison holds if p is below 0.05 and the interval over world models lies on the side that the claim says. It does not
 hold if that interval lies on the other side. Otherwise it is open, also with a single world model on one side or without any
 variation between them. A claim has a verdict if all of its comparisons agree, which the paper's own gaps often do not. Single
 comparisons are not corrected for their number, and those with one and the same cell, such as Only-RGB, are no independent
-evidence. "Recurrent policies gain less by dynamics" compares a row's gain over Only-RGB with both kinds of policies. Scenes of
-two tasks are not the same; their gaps are those of independent scenes. The paper says two things that its tables do not: that
-joint training is better for Only-RGB, and that velocity has the lowest PE.
+evidence. Comparisons of two tasks pair scenes by their number alone. "Recurrent policies gain less by dynamics" compares what
+recurrent policies have more than feed-forward ones, with dynamics and with Only-RGB.
 
 Comparisons are of the default encoder unless they name a plain CNN. With the default encoder even Only-RGB nearly solves
 task 1, which leaves no room for gaps. The plain CNN is nearer to the paper, which has "a simple CNN-based encoder" and gives
 neither layers nor sizes; ours is trained with everything else that the default is trained with
-([deviations](../README.md#choices-and-deviations-from-the-paper)). In the paper, most failures of Only-RGB with
-feed-forward policies are drops; here they are misses, since demonstrations hardly move the block on the cart.
+([deviations](../README.md#choices-and-deviations-from-the-paper)). In the paper, Only-RGB with feed-forward policies fails by
+drops; with a plain CNN it fails by misses here, since demonstrations hardly move the block on the cart.
 
 {claims}
 
-In closed loop on task 3, the predictions of the frozen world models fail, as the paper expects of dynamics out of domain, but
-the policies do not:
+On task 3, the predictions of the frozen world models fail, as the paper expects of dynamics out of domain, but the policies do
+not. These are means over all steps of the episodes in closed loop, most of them after the block has dropped, when the cart
+rests where no demonstration of task 1 goes:
 
 {transfer}
 

@@ -66,8 +66,12 @@ class Cell:
 
     @property
     def fingerprints(self) -> list[str]:
-        """Fingerprints of the frozen world models; none where world models are trained with their policies."""
-        return [found for result in self.results if (found := result.get("world_model_sha256"))]
+        """Fingerprints of the world models, in their order."""
+        found = []
+        for result in self.results:
+            frozen = result.get("world_model_sha256")
+            found += [frozen] if frozen else [seed["world_model_sha256"] for seed in result["results"]]
+        return found
 
     def rates(self, outcome: str = "success") -> list[float]:
         """Return the mean of an outcome for each world model, over its policies (%, or mm of ``position_error``)."""

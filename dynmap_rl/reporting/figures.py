@@ -174,7 +174,9 @@ def moving_steps(episode: TensorDictBase, count: int, first: int = 0) -> list[in
 
 
 def plot_distributions(dynamics: dict[str, TensorDictBase], path: Path) -> dict[str, dict[str, list[float]]]:
-    """Draw histograms of the angles and angular velocities of cart and block, a row for each task.
+    """Draw histograms of the angles and angular velocities of cart and block, and of the block's tilt on the cart.
+
+    Every task has a row.
 
     Args:
         dynamics: ``position`` and ``velocity`` ``[E, T, 6]`` by name of the task.
@@ -184,14 +186,15 @@ def plot_distributions(dynamics: dict[str, TensorDictBase], path: Path) -> dict[
         For each task and each histogram the 0.1, 50 and 99.9 % quantiles of the magnitude (rad, rad/s).
     """
     panels = {
-        f"{body} {name}": (quantity, index, unit)
+        f"{body} {name}": (lambda d, quantity=quantity, index=index: d[quantity][..., index], unit)
         for name, quantity, unit in (("angle", "position", "rad"), ("angular velocity", "velocity", "rad/s"))
         for body, index in (("cart", 2), ("block", 5))
     }
-    figure, axes = plt.subplots(len(dynamics), len(panels), figsize=(12, 2 * len(dynamics)), squeeze=False)
+    panels["tilt of the block on the cart"] = (lambda d: d["position"][..., 5] - d["position"][..., 2], "rad")
+    figure, axes = plt.subplots(len(dynamics), len(panels), figsize=(15, 2 * len(dynamics)), squeeze=False)
     ranges: dict[str, dict[str, list[float]]] = {task: {} for task in dynamics}
-    for column, (title, (quantity, index, unit)) in enumerate(panels.items()):
-        values = {task: d[quantity][..., index].flatten().double().numpy() for task, d in dynamics.items()}
+    for column, (title, (measure, unit)) in enumerate(panels.items()):
+        values = {task: measure(d).flatten().double().numpy() for task, d in dynamics.items()}
         for row, (task, value) in enumerate(values.items()):
             axis, limit = axes[row, column], np.abs(value).max() or 1
             axis.hist(value, bins=np.linspace(-limit, limit, 81), log=True, color="tab:green")

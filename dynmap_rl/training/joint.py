@@ -173,7 +173,7 @@ def train_seeds(
     """
     compute, folder = compute or Compute(), Path(folder)
     todo = [seed for seed in seeds if not (folder / f"seed_{seed}" / "eval.json").exists()]
-    threads = compute.threads if len(todo) == 1 else 1
+    threads = compute.threads if len(seeds) == 1 else 1
     work = _Work(
         load, folder, world_model, policy, settings, judge, compute.device, threads, logger, by_entry
     )
@@ -207,5 +207,6 @@ def _train_and_evaluate(arguments: tuple[_Work, int]) -> None:
     world_model.eval(), policy.eval()
     save_world_model(folder / "world_model", world_model)
     save_policy(folder / "policy", policy, world_model)
+    torch.set_num_threads(1)
     result = work.judge(world_model, policy)
     write_json(folder / "eval.json", result | {"world_model_sha256": fingerprint(world_model)})

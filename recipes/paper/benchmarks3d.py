@@ -31,11 +31,11 @@ class Config:
     results: Path = RECIPES / "results/benchmarks3d"
     # Folder of the runs.
     runs: Path = Path("runs/benchmarks3d")
-    # Cells to run: a part of their names.
+    # Runs to execute: a part of their names.
     only: str = ""
     # Scenes of an evaluation.
     episodes: int = 500
-    # Cells at a time on this machine; each takes two cores if it is alone, otherwise one.
+    # Runs at a time on this machine; each takes two cores if it is alone, otherwise one.
     workers: int = 1
     # Folder with a settings file RECIPE.yaml for any of the recipes, passed to them as --config_path.
     presets: Path | None = None

@@ -59,7 +59,7 @@ class Config:
 
 
 def main(config: Config) -> None:
-    """Evaluate the cells without a result; draw and write."""
+    """Evaluate what has no result yet; draw and write."""
     import torch
 
     from dynmap_rl.paper.delays import CONDITIONS, DELAYS, frame_delay

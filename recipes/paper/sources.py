@@ -31,7 +31,7 @@ RESULTS = RECIPES / "results"
 class Config:
     """Settings of the recipe."""
 
-    # Cells: table (sources), data (numbers of demonstrations, task 1), or all.
+    # Runs: table (sources), data (numbers of demonstrations, task 1), or all.
     part: str = "all"
     # Tasks of the table, with commas between.
     tasks: str = "balance_reaching"
@@ -50,7 +50,7 @@ class Config:
     runs: Path | None = None
     # Folder of the derived datasets.
     datasets: Path = Path("datasets/sources")
-    # Cells at a time; each takes two cores if it is alone, otherwise one.
+    # Runs at a time; each takes two cores if it is alone, otherwise one.
     workers: int = 1
     # Demonstrations that the linear maps are fitted to.
     probe_episodes: int = 100

@@ -95,3 +95,11 @@ def test_a_point_and_a_single_body_change_like_the_first_of_two_bodies(size):
     for quantity, values in out["dynamics"].items():
         assert torch.equal(values, expected["dynamics", quantity][..., :size])
     assert not torch.equal(out["dynamics", "position"], few["dynamics", "position"])
+
+
+def test_windows_of_other_sizes_cannot_be_moved():
+    episodes = make_episodes(2, 2)
+    episodes["goal"] = torch.zeros(2, 2, 3)
+    with pytest.raises(ValueError, match=r"got \{'action': 3, 'goal': 3\}"):
+        augment(episodes, torch.Generator())
+    assert (augment(episodes, torch.Generator(), Augmentation.off())["goal"] == 0).all()

@@ -4,6 +4,7 @@ import json
 
 import pytest
 from made_up import flags, write
+from scipy.stats import ttest_ind, ttest_rel
 
 from dynmap_rl.paper.claims import list_pairs
 from dynmap_rl.paper.findings import (
@@ -101,6 +102,24 @@ def test_policies_on_the_same_world_models_are_compared_in_pairs(tmp_path, recur
     write(tmp_path, "Only-RGB", *feedforward, policy="feedforward")
     found = compare(tmp_path)[RECURRENT, "task 1, decoupled", "Only-RGB", "SR"]
     assert found["verdict"] == verdict
+
+
+def test_policies_on_partly_other_world_models_are_not_compared_in_pairs(tmp_path):
+    """All of them count: a pair of two that happen to share one says little."""
+    write(tmp_path, "Only-RGB", 38, 36, 40)
+    write(tmp_path, "Only-RGB", 20, 22, 18, policy="feedforward", first=2)
+    found = compare(tmp_path)[RECURRENT, "task 1, decoupled", "Only-RGB", "SR"]
+    assert found["verdict"] == HOLDS and found["world_models"] == [3, 3]
+    expected = ttest_ind([95, 90, 100], [50, 55, 45], equal_var=False).confidence_interval()
+    assert found["trainings"] == pytest.approx((expected.low, expected.high))
+
+
+def test_a_joint_world_model_is_the_same_on_two_tasks(tmp_path):
+    write(tmp_path, "RGB+[P]", 20, 22, 24, training="joint")
+    write(tmp_path, "RGB+[P]", 30, 33, 35, training="joint", task="balance_reaching_obstacle")
+    found = compare(tmp_path)["Task 2 is imitated better than task 1", "joint", "RGB+[P]", "SR"]
+    expected = ttest_rel([75, 82.5, 87.5], [50, 55, 60]).confidence_interval()
+    assert found["trainings"] == pytest.approx((expected.low, expected.high))
 
 
 def test_fewer_drops_and_smaller_errors_are_better(tmp_path):

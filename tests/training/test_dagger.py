@@ -1,4 +1,4 @@
-"""Corrections: the student acts, the expert says what it would have done."""
+"""Corrections: the policy acts, the expert says what it would have done."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ from dynmap_rl.training.dagger import FIRST_SCENE, add_corrections, collect_corr
 
 
 class Replay(torch.nn.Module):
-    """A student that plays actions ``[E, T, 3]`` from memory."""
+    """A policy that plays actions ``[E, T, 3]`` from memory."""
 
     def __init__(self, actions):
         super().__init__()
@@ -30,14 +30,14 @@ class Replay(torch.nn.Module):
         return self.actions[:, self.t]
 
 
-def student(actions):
+def from_memory(actions):
     return TensorDictModule(Replay(actions), in_keys=["pixels"], out_keys=["action"])
 
 
-def test_a_student_that_acts_like_the_expert_is_not_corrected():
+def test_a_policy_that_acts_like_the_expert_is_not_corrected():
     seeds, checkpoint = [scene_seed("train", i) for i in (5, 6)], list_checkpoints("balance_reaching")[-1]
     truth = run_plans("balance_reaching", [Plan(seed, checkpoint) for seed in seeds])
-    corrected = collect_corrections(student(truth["action"]), "balance_reaching", seeds)
+    corrected = collect_corrections(from_memory(truth["action"]), "balance_reaching", seeds)
     assert corrected.shape == (2, 120)
     for key in ("pixels", "goal", "action", "expert_action", ("dynamics", "velocity")):
         torch.testing.assert_close(corrected[key], truth[key], rtol=0, atol=1e-6, msg=str(key))
@@ -48,7 +48,7 @@ def test_steps_after_a_failure_are_marked_and_actions_are_those_that_the_cart_ex
     """Full acceleration to one side drops the block; the expert would have done something else."""
     actions = torch.zeros(1, 120, 3)
     actions[:, :, 0] = 0.04 * torch.from_numpy(np.sign(np.sin(np.arange(120) / 4))).float()
-    corrected = collect_corrections(student(actions), "balance_reaching", [scene_seed("train", 0)])
+    corrected = collect_corrections(from_memory(actions), "balance_reaching", [scene_seed("train", 0)])
     failed = corrected["failed"][0, :, 0]
     assert not failed[0] and failed[-1] and failed.int().diff().min() == 0
     assert not torch.equal(corrected["action"], corrected["expert_action"])
@@ -59,7 +59,7 @@ def test_a_correction_is_what_the_cart_could_execute(monkeypatch):
     monkeypatch.setattr(
         "dynmap_rl.training.dagger.load_expert", lambda task: lambda state: [torch.full((1, 3), 1e3)]
     )
-    still = student(torch.zeros(1, 120, 3))
+    still = from_memory(torch.zeros(1, 120, 3))
     corrected = collect_corrections(still, "balance_reaching", [scene_seed("train", 0)])["expert_action"][0]
     torch.testing.assert_close(corrected, torch.from_numpy(LARGEST_CHANGE).float().expand(120, 3))
 
