@@ -107,7 +107,9 @@ def markdown_claims(comparisons: list[dict]) -> str:
         comparisons: result of :func:`compare_cells`.
     """
     lines, missing, pairs = [], {}, list_pairs()
-    for part in dict.fromkeys((pair.claim, pair.group, pair.metric) for pair in pairs):
+    claims = list(dict.fromkeys(pair.claim for pair in pairs))
+    parts = dict.fromkeys((pair.claim, pair.group, pair.metric) for pair in pairs)
+    for part in sorted(parts, key=lambda part: claims.index(part[0])):
         own = [row for row in comparisons if (row["claim"], row["group"], row["metric"]) == part]
         paper = [pair.paper_gap for pair in pairs if (pair.claim, pair.group, pair.metric) == part]
         if not own:
