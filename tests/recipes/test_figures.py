@@ -78,7 +78,8 @@ def test_draws_the_distributions_and_writes_their_ranges(recording, tmp_path):
     main(Config(only="distributions", datasets=str(recording), output=tmp_path / "figures"))
     assert (tmp_path / "figures/distributions.png").stat().st_size > 5000
     ranges = read_json(tmp_path / "figures/distributions.json")["ranges"]["balance_reaching"]
-    assert set(ranges) == {"cart angle", "block angle", "cart angular velocity", "block angular velocity"}
+    angles = {f"{body} {name}" for body in ("cart", "block") for name in ("angle", "angular velocity")}
+    assert set(ranges) == angles | {"tilt of the block on the cart"}
     for low, middle, high in ranges.values():
         assert 0 <= low <= middle < high
     assert ranges["block angle"][2] < 1, "demonstrations of task 1 carry the block upright"

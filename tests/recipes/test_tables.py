@@ -71,7 +71,7 @@ def fake_script(calls):
         (run / "eval.json").write_text(json.dumps({
             "task": task, "policy": "recurrent", "row": "Only-RGB", "settings": {"world_model": {"seed": 0}},
             "world_model": {"task": TASKS[0], "training": "joint"},
-            "results": [{"test": {"rows": rows}, "paper": {"rows": rows}}],
+            "results": [{"test": {"rows": rows}, "paper": {"rows": rows}, "world_model_sha256": "0"}],
             "test_protocol": metrics | {"episodes": 3}, "paper_protocol": {k: (v, 0.0) for k, v in metrics.items()},
             "seeds": [0], "command": "python x.py", "world_model_sha256": None if script.stem == "joint" else "0",
         }))  # fmt: skip
