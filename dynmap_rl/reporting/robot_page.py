@@ -28,7 +28,7 @@ def write_robot_report(
     camera: str | None,
     goal: str | None,
     policy: str,
-    source: dict[str, str],
+    origin: dict[str, str],
     settings: dict,
     command: str,
     frozen: str | None = None,
@@ -44,7 +44,7 @@ def write_robot_report(
         camera: camera's column; None is the first camera.
         goal: goal's column and entries, or None.
         policy: kind of the policies, ``feedforward`` or ``recurrent``.
-        source: origin of the world model, with ``dataset`` and ``training`` (decoupled or joint).
+        origin: origin of the world model, with ``dataset`` and ``training`` (decoupled or joint).
         settings: settings of the run, as a nested dict of JSON values.
         command: command that started the run.
         frozen: fingerprint of the frozen world model; None where every seed has a world model of its own.
@@ -65,14 +65,14 @@ def write_robot_report(
     names, dt = described["names"], 1 / (described["info"].get("fps") or 1)
     names = {key: names[key] for key in (*world_model.supervision, "action")}
     result = {
-        "row": row_name(world_model.supervision, source["training"]),
+        "row": row_name(world_model.supervision, origin["training"]),
         "policy": policy,
         "trained_on": {
             "dataset": str(dataset),
             "held_out_episodes": episodes["episode"].unique().tolist(),
             "held_out_pieces": list(episodes.shape),
         },
-        "world_model": source,
+        "world_model": origin,
         "seeds": list(seeds),
         "world_model_sha256": frozen,
         "held_out": {"rgb": errors["error_rgb"], "imitation_l1": errors["imitation_l1"]}

@@ -23,8 +23,8 @@ def folder(tmp_path):
 
 
 def write(folder, episodes, **options):
-    source = {"training": "joint", "dataset": "robot"}
-    common = {"dataset": "robot", "camera": None, "goal": None, "policy": "recurrent", "source": source}
+    origin = {"training": "joint", "dataset": "robot"}
+    common = {"dataset": "robot", "camera": None, "goal": None, "policy": "recurrent", "origin": origin}
     settings = {"settings": {"dataset": "robot"}, "command": "python x.py"}
     return write_robot_report(folder, make_model().eval(), episodes, [0, 1], **common, **settings, **options)
 
