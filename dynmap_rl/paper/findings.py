@@ -43,21 +43,17 @@ def compare_cells(cells: Mapping[Key, Cell]) -> list[dict]:
     ]
 
 
-def gap_over_trainings(
-    a: Sequence[Cell], b: Sequence[Cell], outcome: str = "success"
-) -> tuple[float, float] | None:
+def gap_over_trainings(ours: Mapping[str, float], theirs: Mapping[str, float]) -> tuple[float, float] | None:
     """Return the 95 % interval of the gap over world models, or None where their number says nothing.
 
     It is paired where both sides have policies on the same world models and no others, as recurrent and feed-forward
     policies of a row, or a row on two tasks; otherwise Welch's.
 
     Args:
-        a: one cell, or two on the same frozen world models, of which the second is subtracted.
-        b: likewise; subtracted from ``a``.
-        outcome: entry of the episodes' rows.
+        ours: mean outcome of each world model, by its fingerprint.
+        theirs: likewise; subtracted.
     """
-    ours, theirs = _by_world_model(a, outcome), _by_world_model(b, outcome)
-    if set(ours) == set(theirs):
+    if ours.keys() == theirs.keys():
         return paired_interval([*ours.values()], [theirs[name] for name in ours])
     return welch_interval([*ours.values()], [*theirs.values()])
 
@@ -73,11 +69,12 @@ def _by_world_model(side: Sequence[Cell], outcome: str) -> dict[str, float]:
 def _compare(pair: Pair, cells: Mapping[Key, Cell]) -> dict:
     outcome, _ = METRICS[pair.metric]
     found = outcome_gap([(sign, cells[key].policies) for sign, key in pair.terms], outcome)
-    a, b = ([cells[key] for key in side] for side in (pair.a, pair.b))
-    trainings = gap_over_trainings(a, b, outcome)
+    sides = [[cells[key] for key in side] for side in (pair.a, pair.b)]
+    ours, theirs = (_by_world_model(side, outcome) for side in sides)
+    trainings = gap_over_trainings(ours, theirs)
     low, high = trainings if trainings and found["p"] < LEVEL else (0, 0)
     above, below = (low > 0, high < 0)[:: pair.sign]
-    values = [[cell.summary[pair.metric] for cell in side] for side in (a, b)]
+    values = [[cell.summary[pair.metric] for cell in side] for side in sides]
     return {
         "claim": pair.claim,
         "group": pair.group,
@@ -89,7 +86,7 @@ def _compare(pair: Pair, cells: Mapping[Key, Cell]) -> dict:
         "interval": found["interval"],
         "p": found["p"],
         "trainings": trainings,
-        "world_models": [len(_by_world_model(side, outcome)) for side in (a, b)],
+        "world_models": [len(ours), len(theirs)],
         "verdict": HOLDS if above else FAILED if below else OPEN,
     }
 

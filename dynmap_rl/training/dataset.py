@@ -17,7 +17,7 @@ from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.keys import CAMERAS
 
 LEVEL = 30  # difference of a channel, of 0 to 255
-SHARE = 0.025  # of the pixels of a MuJoCo scene, whose edges graphics libraries draw differently
+SHARE = 0.025  # of the pixels, for tasks that are not in the plane: graphics libraries draw edges differently
 
 
 def find_or_record(task: str, dataset: str | Path | None = None) -> str | Path:
@@ -101,7 +101,7 @@ def check_start(dataset: str | Path, task: str) -> None:
         "state": not np.allclose(recorded[0], rules.agent_pos(world), atol=1e-3),
         "frame": (np.abs(frame.astype(int) - drawn).max(-1) > LEVEL).mean() > (0 if rules.planar else SHARE),
     }
-    for name in (name for name, found in wrong.items() if found):
+    if name := next((name for name, found in wrong.items() if found), None):
         raise ValueError(
             f"the first {name} of {dataset} is not that of {task} now: its scene, goal or camera has changed; delete the "
             "dataset to record it again, or choose another --dataset"
