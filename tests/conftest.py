@@ -67,6 +67,19 @@ def shared(tmp_path_factory):
     return root / "shared"
 
 
+@pytest.fixture
+def ray(shared, monkeypatch):
+    """Return Ray, for a cluster of the test's own: of two clusters that start at the same time, both may fail."""
+    from filelock import FileLock
+
+    ray = pytest.importorskip("ray")
+    monkeypatch.setenv("RAY_ADDRESS", "local")  # otherwise Ray would join the last cluster of this machine
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    with FileLock(shared / "ray.lock"):
+        yield ray
+        ray.shutdown()
+
+
 @pytest.fixture(scope="session")
 def recordings(shared):
     """Return a function from a task to a small dataset, 4 + 2 demonstrations in three shards, which is read only."""

@@ -86,15 +86,9 @@ def test_a_complete_recording_is_left_as_it_is(recording):
 
 
 @pytest.mark.slow
-def test_ray_records_the_same_bits(recording, tmp_path, monkeypatch):
-    ray = pytest.importorskip("ray")
-    monkeypatch.setenv("RAY_ADDRESS", "local")  # otherwise Ray joins a cluster of another test
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+def test_ray_records_the_same_bits(ray, recording, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "SHARD_EPISODES", 2)
-    try:
-        root = record_dataset(tmp_path / "recording", episodes=4, eval_episodes=2, launcher="ray")
-    finally:
-        ray.shutdown()
+    root = record_dataset(tmp_path / "recording", episodes=4, eval_episodes=2, launcher="ray")
     assert files(root) == files(recording)
 
 

@@ -136,16 +136,9 @@ def test_launchers_are_checked(monkeypatch):
 
 
 @pytest.mark.slow
-def test_ray_reports_a_run_whose_process_died(monkeypatch):
-    ray = pytest.importorskip("ray")
-    monkeypatch.setenv("RAY_ADDRESS", "local")  # otherwise Ray joins a cluster of another test
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-
+def test_ray_reports_a_run_whose_process_died(ray):
     def die_at_b(run):
         return os._exit(1) if run.name == "b" else None
 
-    try:
-        messages = launch(RUNS, die_at_b, "ray", cpus=1)
-    finally:
-        ray.shutdown()
+    messages = launch(RUNS, die_at_b, "ray", cpus=1)
     assert messages == ["b was lost by Ray (WorkerCrashedError); the same command resumes"]

@@ -144,11 +144,8 @@ def test_real_cells(recordings, tmp_path):
 
 
 @pytest.mark.slow
-def test_ray_runs_the_same_cells(recordings, tmp_path, monkeypatch):
-    pytest.importorskip("ray")
+def test_ray_runs_the_same_cells(ray, recordings, tmp_path):
     commands.place_recordings(tmp_path, recordings, *TASKS[:2])
-    monkeypatch.setenv("RAY_ADDRESS", "local")  # otherwise Ray joins a cluster of another test
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     (tmp_path / "runs/tables" / NAMES[2]).mkdir(parents=True)
     (tmp_path / "runs/tables" / NAMES[2] / "config.json").write_text(
         "{}"

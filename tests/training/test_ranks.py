@@ -14,21 +14,15 @@ SCRIPT = Path(__file__).with_name("two_ranks.py")
 TRAININGS = "world_model", "labelled", "joint", "end_to_end"
 
 
-LAUNCHERS = "torchrun", "ray"
-
-
 def run(folder: Path, processes: int, *arguments: str, launcher: str = "torchrun"):
     """Return the completed command."""
     command = [sys.executable]
     if launcher == "ray":
-        pytest.importorskip("ray")
         arguments += "--compute.launcher", "ray", "--compute.ranks", str(processes)
     else:
         command += ["-m", "torch.distributed.run", "--nproc_per_node", str(processes), "--standalone"]
     tests = os.pathsep.join([str(SCRIPT.parents[1]), *sys.path])
-    # Without an address, Ray would look for the last cluster that was started on this machine.
-    ray = {"RAY_ADDRESS": "local", "RAY_USAGE_STATS_ENABLED": "0"}
-    env = os.environ | {"PYTHONPATH": tests} | ray
+    env = os.environ | {"PYTHONPATH": tests}
     for _ in range(3):  # Ray allows its processes 30 s to start, which a busy machine may exceed
         result = subprocess.run(
             [*command, str(SCRIPT), "--folder", str(folder), *arguments],
@@ -47,6 +41,14 @@ def read_losses(folder: Path) -> dict[str, list[dict]]:
     return {name: [{k: v for k, v in row.items() if "loss_" in k} for row in rows[name]] for name in rows}
 
 
+@pytest.fixture(params=("torchrun", "ray"))
+def launcher(request):
+    """Return the name of a launcher."""
+    if request.param == "ray":
+        request.getfixturevalue("ray")
+    return request.param
+
+
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory):
     """Return the losses of one process."""
@@ -56,7 +58,6 @@ def alone(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("launcher", LAUNCHERS)
 def test_two_processes_have_the_losses_of_one(alone, tmp_path, launcher):
     result = run(tmp_path, 2, launcher=launcher)
     assert result.returncode == 0, result.stderr
@@ -69,7 +70,6 @@ def test_two_processes_have_the_losses_of_one(alone, tmp_path, launcher):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("launcher", LAUNCHERS)
 def test_a_process_that_dies_ends_the_run_which_resumes_with_any_number(alone, tmp_path, launcher):
     result = run(tmp_path, 2, "--update", "11", launcher=launcher)
     if launcher == "ray":
@@ -96,7 +96,7 @@ def test_a_process_that_dies_ends_the_run_which_resumes_with_any_number(alone, t
         ),
     ],
 )
-def test_ray_gives_the_same_one_line_for_a_bad_input(tmp_path, option, value, message):
+def test_ray_gives_the_same_one_line_for_a_bad_input(ray, tmp_path, option, value, message):
     result = run(tmp_path, 2, option, value, launcher="ray")
     assert result.returncode == 2 and len(result.stderr.splitlines()) == 1
     assert result.stderr.startswith(f"error: {message}")
