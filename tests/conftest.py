@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import zipfile
+from importlib.util import find_spec
 from pathlib import Path
 
 os.environ["HF_HUB_OFFLINE"] = "1"
@@ -69,14 +70,17 @@ def shared(tmp_path_factory):
 
 @pytest.fixture
 def ray(shared, monkeypatch):
-    """Return Ray, for a cluster of the test's own: of two clusters that start at the same time, both may fail."""
+    """Let the test start a Ray cluster of its own: of two clusters that start at the same time, both may fail."""
     from filelock import FileLock
 
-    ray = pytest.importorskip("ray")
+    if find_spec("ray") is None:
+        pytest.skip("Ray is not installed")
     monkeypatch.setenv("RAY_ADDRESS", "local")  # otherwise Ray would join the last cluster of this machine
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     with FileLock(shared / "ray.lock"):
-        yield ray
+        yield
+        import ray
+
         ray.shutdown()
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Sequence
 from importlib.util import find_spec
 
 LAUNCHERS = "local", "ray"
+# Under `uv run`, Ray would copy the working directory and install it once more for every worker. Read as Ray is imported.
+os.environ.setdefault("RAY_ENABLE_UV_RUN_RUNTIME_ENV", "0")
 
 
 def check_launcher(launcher: str) -> None:
