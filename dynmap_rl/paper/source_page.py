@@ -13,8 +13,10 @@ from .source_results import (
     plot_measures,
     plot_sources,
     rank_correlations,
+    read_source,
     source_table,
 )
+from .sources import POLICIES, SOURCES
 from .tables import join_table, p_text
 
 FORMS = {"glimpse": "the default encoder and decoder", "plain": "a plain CNN"}
@@ -25,7 +27,7 @@ def write_source_page(results: Path, tasks: list[str], architecture: str = "glim
 
     Args:
         results: folder of the results.
-        tasks: names of the tasks.
+        tasks: names of the tasks; those without a result are left out.
         architecture: form of the world models.
     """
     parts = [
@@ -38,15 +40,17 @@ def write_source_page(results: Path, tasks: list[str], architecture: str = "glim
     ]
     written = []
     for task in tasks:
+        if not any(read_source(results, task, source, policy) for source in SOURCES for policy in POLICIES):
+            continue
         parts += [f"## {task}", source_table(results, task)]
-        for name, plot in (("sources", plot_sources), ("measures", plot_measures)):
-            written.append(results / f"{get_task(task).name}_{name}.png")
-            plot(results, task, written[-1])
-            parts.append(f"![{name}]({written[-1].name})")
         rows = [
             [name, f"{row['rho']:.2f}", p_text(row["p"]), str(row["sources"])]
             for name, row in rank_correlations(results, task).items()
         ]
+        for name, plot in (("sources", plot_sources), *([("measures", plot_measures)] if rows else [])):
+            written.append(results / f"{get_task(task).name}_{name}.png")
+            plot(results, task, written[-1])
+            parts.append(f"![{name}]({written[-1].name})")
         if rows:
             parts.append(join_table(["policy, measure", "rank correlation with SR", "p", "sources"], rows))
     written.append(results / "data.png")

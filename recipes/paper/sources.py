@@ -151,10 +151,11 @@ def measure(config: Config, runs: list) -> None:
 
 
 def write(config: Config) -> None:
-    """Write README.md and the figures into the folder of the results."""
+    """Write README.md and the figures, of all tasks with results, into the folder of the results."""
+    from dynmap_rl.envs.tasks import TASKS
     from dynmap_rl.paper.source_page import write_source_page
 
-    tasks = config.tasks.split(",")
+    tasks = [*dict.fromkeys([*TASKS, *config.tasks.split(",")])]
     if not any(config.results.glob("*.json")):
         raise ValueError(f"{config.results} must have results; run recipes/paper/sources.py first")
     print(

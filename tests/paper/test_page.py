@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from dynmap_rl.envs.tasks import TASKS
 from dynmap_rl.evaluation.protocol import result_rows
 from dynmap_rl.evaluation.statistics import FEW, shared_interval
 from dynmap_rl.paper import page
@@ -47,7 +48,7 @@ def test_the_pages_of_the_other_grids_are_generated(folder, tmp_path):
     elif folder == "delays":
         text = delay_page(read_delays(results))
     else:
-        text = write_source_page(results, ["balance_reaching"], "plain")[-1].read_text()
+        text = write_source_page(results, list(TASKS), "plain")[-1].read_text()
     assert text == (RESULTS / folder / "README.md").read_text()
 
 
