@@ -80,8 +80,9 @@ def test_cells_run_once_and_make_a_page(calls, tmp_path):
     page = (tmp_path / "results/README.md").read_text()
     assert "frames: tracks" in page and "| RGB+[P+V], tracked | **66.7**" in page
     assert "doubtful (residual)" in page
-    for name in (f"{TASK}_sources", f"{TASK}_measures", "data"):
+    for name in (f"{TASK}_sources", "data"):
         assert (tmp_path / f"results/{name}.png").exists() and f"({name}.png)" in page
+    assert not (tmp_path / f"results/{TASK}_measures.png").exists(), "of world models that are not measured"
     calls.clear()
     assert run(tmp_path, "--only", "tracks,none,simulator,end_to_end").returncode == 0 and calls == []
     (tmp_path / f"results/{TASK}_tracks_world_model_1_feedforward.json").unlink()
