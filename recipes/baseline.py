@@ -86,7 +86,7 @@ def main(config: Config) -> None:
         print(f"{folder} is complete; delete it to run again\n\n{row_text(read_json(folder / 'eval.json'))}")
         return
     torch.set_num_threads(config.compute.threads)
-    dataset = find_or_record(config.task, config.dataset)
+    dataset = find_or_record(config.task, config.dataset, folder)
     for seed in seeds:
         if not (folder / f"seed_{seed}/eval.json").exists():
             train(config, dataset, folder / f"seed_{seed}", seed, str(device))

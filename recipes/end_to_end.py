@@ -78,7 +78,7 @@ def main(config: Config) -> None:
         return
 
     with first_rank_first():
-        dataset = find_or_record(config.task, config.dataset)
+        dataset = find_or_record(config.task, config.dataset, folder)
     augmentation = choose_augmentation(task, config.training.augmentation, imitated=True)
     training = replace(config.training, augmentation=augmentation)
     config = replace(config, training=training)

@@ -73,6 +73,7 @@ def main(config: Config) -> None:
     from dynmap_rl.runs.folder import open_run, plain_settings
     from dynmap_rl.runs.loggers import check_logger
     from dynmap_rl.training.dagger import check_corrections
+    from dynmap_rl.training.dataset import keep_dataset
     from dynmap_rl.training.decoupled import train_policies
     from dynmap_rl.training.joint import train_seeds
     from dynmap_rl.training.world_model import build_world_model, train_world_model
@@ -84,16 +85,18 @@ def main(config: Config) -> None:
     check_logger(config.logger)
     check_corrections(config.policy, None)
     supervision = parse_supervision(config.world_model.supervision)
-    describe_robot_dataset(config.dataset, config.camera, config.goal, supervision)
+    steps = (config.joint if config.method == "joint" else config.world_model).window_steps
+    data = describe_robot_dataset(config.dataset, config.camera, config.goal, supervision, steps)
     folder = config.run or default_folder(config)
     open_run(folder, config, ignore=("run", "compute", "logger"))
+    keep_dataset(folder, config.dataset)
     if (folder / "eval.json").exists():
         result = read_json(folder / "eval.json")
         print(f"{folder} is complete; delete it to run again\n\n{robot_row_text(result)}")
         return
 
     torch.set_num_threads(config.compute.threads)
-    steps = (config.joint if config.method == "joint" else config.world_model).window_steps
+    print(describe_pieces(data))
     load = partial(load_robot_dataset, config.dataset, steps, config.camera, config.goal, config.image_size)
     judge, fingerprint = partial(judge_held_out, load=load), None
     episodes, constants = load()
@@ -140,6 +143,17 @@ def check_config(config: Config) -> None:
         refuse(config.policy, POLICY, own(PolicyTraining, PolicyArchitecture), other, "policy.")
     else:
         refuse(config.joint, JOINT, [field.name for field in fields(JointTraining)], other, "joint.")
+
+
+def describe_pieces(data: dict) -> str:
+    """Return what is trained on and held out as text."""
+    held_out = ", ".join(map(str, data["splits"]["eval"]))
+    text = f"pieces of {data['steps']} steps; held out: episodes {held_out}"
+    if data["left_out"]:
+        text += f"; left out, as too short: {', '.join(map(str, data['left_out']))}"
+    if data["info"].get("total_tasks", 1) > 1 and not data["goal"]:
+        text += "\nthe dataset has several tasks, which a policy without --goal cannot tell apart"
+    return text
 
 
 def default_folder(config: Config) -> Path:

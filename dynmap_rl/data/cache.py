@@ -47,7 +47,7 @@ def open_cached(
         OSError: the cache cannot be written, or the disk is full.
     """
     place = _find_place(root.resolve(), cache)
-    name = _hash_content(root, settings)
+    name = hash_content(root, settings)
     entry = place / name
     try:
         if not entry.exists():
@@ -73,7 +73,7 @@ def _find_place(root: Path, cache: Path | None) -> Path:
     return Path(cache).expanduser() / f"{root.name}_{path}"
 
 
-def _hash_content(root: Path, settings: object) -> str:
+def hash_content(root: Path, settings: object = None) -> str:
     """Return a name that depends on the settings and on every byte of the data files and of the metadata."""
     files = [root / "meta/info.json", *sorted((root / "data").glob("*/*.parquet"))]
 

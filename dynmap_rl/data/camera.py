@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from tqdm import tqdm
 
 from dynmap_rl.envs.task import BODIES
 
@@ -139,12 +140,20 @@ def read_motion(root: Path, info: dict, camera: FrameSource) -> Iterator[tuple[i
     Raises:
         ValueError: a file is damaged, or what should be tracked is not found; the message names the episode.
     """
-    fps = info.get("fps") or 1
-    for episode, frames, factor in iterate_frames(root, info, camera.column, widest=WIDEST):
+    fps, failed = info.get("fps") or 1, {}
+    episodes = iterate_frames(root, info, camera.column, widest=WIDEST)
+    for episode, frames, factor in tqdm(episodes, "tracking", info.get("total_episodes"), leave=False):
         try:
             yield episode, measure(frames, factor, camera, fps)
         except ValueError as error:
-            raise ValueError(f"{root}: in episode {episode} {error}") from error
+            failed.setdefault(str(error), []).append(episode)
+    if failed:
+        raise ValueError(f"{root}: {'; '.join(f'in {_number(e)} {text}' for text, e in failed.items())}")
+
+
+def _number(episodes: list[int]) -> str:
+    """Return episodes as text."""
+    return f"episode{'s' * (len(episodes) > 1)} {', '.join(map(str, episodes))}"
 
 
 def measure(frames: np.ndarray, factor: float, camera: FrameSource, fps: float) -> Motion:

@@ -14,7 +14,8 @@ from tensordict import TensorDict
 from dynmap_rl.envs.protocol import Layout
 from dynmap_rl.keys import CAMERAS, NEEDED, OPTIONAL
 
-from .format.reading import decode_image, image_files, iterate_tables, read_column, read_table
+from .format.images import decode_image, image_files
+from .format.reading import iterate_tables, read_column, read_table
 
 BLOCK = 500  # frames that a thread decodes at a time
 FLAGS = "done", "terminated", "truncated"

@@ -166,6 +166,7 @@ def add_dynamics(
     table = read_table(root, info, ["timestamp", *old])
     time = read_column(root, info, table, "timestamp", np.float64).numpy()[:, 0]
     rows = dict(spans(table["episode_index"].to_numpy()))
+    _check_lengths(root, rows, [part[2] for part in parts], window)
     values, derived, start = {q: np.empty((len(table), len(names))) for q in DYNAMICS}, [], 0
     for own_names, motions, own_method in parts:
         own = slice(start, start := start + len(own_names))
@@ -177,6 +178,9 @@ def add_dynamics(
             for quantity, part in found.items():
                 values[quantity][rows[episode], own] = part
             derived.append(Derived(episode, own_names, found["position"], found["velocity"], motion))
+            angles = motion.angles
+        for entry in angles:
+            align_turns(values["position"][:, own][:, entry], list(rows.values()), motion.period)
     new = {f"dynamics.{q}": v.astype(np.float32) for q, v in values.items()}
     meta = _describe(meta, planar, names, values, rows) if meta else None
     there = {
@@ -205,6 +209,26 @@ def _derive(
         velocity = motion.velocity
         acceleration = differentiate(velocity, time, method, window, order)[0]
     return {"position": position, "velocity": velocity, "acceleration": acceleration}, motion.light()
+
+
+def align_turns(angle: np.ndarray, rows: list[slice], period: float) -> None:
+    """Shift episodes of an unwrapped angle ``[N]`` in place by whole turns, so that a pose has one value in all of them.
+
+    The mean of each episode is moved to within half a turn of the mean direction of all.
+    """
+    center = np.angle(np.exp(2j * np.pi * angle / period).mean()) * period / (2 * np.pi)
+    for own in rows:
+        angle[own] -= period * np.round((angle[own].mean() - center) / period)
+
+
+def _check_lengths(root: Path, rows: dict[int, slice], methods: list[str], window: int) -> None:
+    needed = window if "savgol" in methods else 3
+    lengths = {episode: own.stop - own.start for episode, own in rows.items()}
+    if short := [f"{episode} ({length} steps)" for episode, length in lengths.items() if length < needed]:
+        raise ValueError(
+            f"{root} must have at least {needed} steps in every episode, got fewer in {', '.join(short)}; use --method "
+            "central or a shorter --window, or delete these episodes (lerobot-edit-dataset)"
+        )
 
 
 def _is_planar(task: str) -> bool:

@@ -22,6 +22,10 @@ LIMITS = {
         0.05, True, "share of the frames in which an object is not found",
         "keep the object in view and unlike its surroundings in colour, or choose its --colors, --objects or --threshold",
     ),
+    "gone": (
+        0.5, True, "the same of the worst episode, whose columns are invented there",
+        "delete that episode (lerobot-edit-dataset), or film it again",
+    ),
     "cut": (
         0.05, True, "share of the frames in which an object touches the border of the picture",
         "film from farther away, so that the object never leaves the picture",
@@ -106,7 +110,8 @@ def judge_quality(derived: Sequence[Derived]) -> dict:
         if not found:
             continue
         sign = 1 if more else -1
-        means = {where: float(np.mean([row[where] for row in found])) for where in found[0]}
+        join = np.max if name == "gone" else np.mean
+        means = {where: float(join([row[where] for row in found])) for where in found[0]}
         where = max(means, key=lambda key, means=means, sign=sign: sign * means[key])
         worst = max(
             range(len(found)), key=lambda i, found=found, where=where, sign=sign: sign * found[i][where]
@@ -157,7 +162,7 @@ def _measure(episode: Derived, extents: dict[str, float]) -> dict[str, dict[str,
     }
     if motion.found is not None:
         bodies = _bodies(names, motion.found.shape[1])
-        result["lost"] = dict(zip(bodies, 1 - motion.found.mean(0), strict=True))
+        result["lost"] = result["gone"] = dict(zip(bodies, 1 - motion.found.mean(0), strict=True))
     if (tracks := motion.tracks) is None:
         return result
     size = np.sqrt([np.median(area[area > 0]) for area in tracks.area.T])

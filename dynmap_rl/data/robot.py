@@ -24,7 +24,11 @@ LONGEST = 120  # steps of a piece; longer pieces make batches of whole pieces sl
 
 
 def describe_robot_dataset(
-    dataset: str | Path, camera: str | None = None, goal: str | None = None, supervision: tuple[str, ...] = ()
+    dataset: str | Path,
+    camera: str | None = None,
+    goal: str | None = None,
+    supervision: tuple[str, ...] = (),
+    min_steps: int = 1,
 ) -> dict:
     """Check what would be loaded of a robot dataset, before any frame is read.
 
@@ -33,13 +37,15 @@ def describe_robot_dataset(
         camera: column of the frames, or several with commas between; by default the first camera.
         goal: ``COLUMN:ENTRIES``, such as ``observation.state:3,4``; by default no goal.
         supervision: quantities of the dynamics whose columns must exist.
+        min_steps: steps of the windows that will be drawn.
 
     Returns:
-        ``root``, ``info`` (content of ``meta/info.json``), ``cameras``, ``goal`` (column and entries, or None), and
-        ``names``: the names of the entries of ``action`` and of every dynamics quantity that the dataset has.
+        ``root``, ``info`` (content of ``meta/info.json``), ``cameras``, ``goal`` (column and entries, or None), ``names``
+        (of the entries of ``action`` and of every dynamics quantity that the dataset has), ``steps`` (T of the pieces),
+        ``splits`` (episodes of ``train`` and ``eval``) and ``left_out`` (episodes that are too short).
 
     Raises:
-        ValueError: the dataset is missing, or lacks a column.
+        ValueError: the dataset is missing or damaged, lacks a column, or has too few episodes that are long enough.
     """
     root = find_dataset(dataset)
     info = read_info(root)
@@ -53,12 +59,21 @@ def describe_robot_dataset(
         )
     views = [name.strip() for name in camera.split(",")] if camera else [None]
     columns = {"action": "action"} | {q: f"dynamics.{q}" for q in DYNAMICS if f"dynamics.{q}" in features}
+    views = [choose_camera(root, info, name) for name in views]
+    goal = _check_goal(root, info, goal)
+    rows = spans(read_table(root, info, [])["episode_index"].to_numpy())
+    lengths = {episode: span.stop - span.start for episode, span in rows}
+    steps = _choose_steps([*lengths.values()], min_steps)
+    usable = [episode for episode, length in lengths.items() if length >= steps]
     return {
         "root": root,
         "info": info,
-        "cameras": [choose_camera(root, info, name) for name in views],
-        "goal": _check_goal(root, info, goal),
+        "cameras": views,
+        "goal": goal,
         "names": {key: entry_names(info, column) for key, column in columns.items()},
+        "steps": steps,
+        "splits": choose_splits(root, info, [*lengths], usable),
+        "left_out": [episode for episode in lengths if episode not in usable],
     }
 
 
@@ -72,11 +87,11 @@ def load_robot_dataset(
     """Load training and held-out pieces of any LeRobot v3.0 dataset, with constants of normalisation.
 
     Frames are resized to S x S with ``cv2.INTER_AREA``, whatever their aspect; those of several cameras stand side by
-    side. Episodes shorter than ``min_steps`` are left out. The others are cut into pieces of T steps, T being the length of
-    the shortest episode, at most 120, or ``min_steps`` if that is more. As many pieces as needed cover an episode, evenly
-    spread; they overlap where T does not divide its length. No piece crosses the border of an episode. Splits named
-    ``train`` and ``eval`` are kept; otherwise every tenth episode is held out, or the last one of fewer than ten. All
-    pieces of an episode are in one split.
+    side. Episodes are cut into pieces of T steps, at most 120, or ``min_steps`` if that is more. Of the episodes with
+    ``min_steps``, a tenth may be shorter than T, so that a few short takes do not shorten all pieces; all shorter episodes
+    are left out. As many pieces as needed cover an episode, evenly spread; they overlap where T does not divide its length.
+    No piece crosses the border of an episode. Splits named ``train`` and ``eval``, ``test`` or ``val`` are kept; otherwise
+    every tenth episode of all is held out, or the last one of fewer than ten. All pieces of an episode are in one split.
 
     Args:
         dataset: local folder or hub id.
@@ -95,12 +110,9 @@ def load_robot_dataset(
     Raises:
         ValueError: the dataset is missing or damaged, or fewer than two episodes are long enough.
     """
-    layout = describe_robot_dataset(dataset, camera, goal)
-    root, info = layout["root"], layout["info"]
+    layout = describe_robot_dataset(dataset, camera, goal, min_steps=min_steps)
+    root, info, splits, steps = (layout[key] for key in ("root", "info", "splits", "steps"))
     numbers, rows = _read_numbers(layout)
-    lengths = {e: r.stop - r.start for e, r in rows.items() if r.stop - r.start >= min_steps}
-    splits = choose_splits(root, info, list(lengths))
-    steps = min(max(LONGEST, min_steps), *lengths.values())
     parts = {name: [] for name in splits}
     size = image_size, image_size
     sources = [iterate_frames(root, info, name, size=size) for name in layout["cameras"]]
@@ -146,6 +158,13 @@ def _check_goal(root: Path, info: dict, goal: str | None) -> tuple[str, list[int
     if not all(0 <= i < feature["shape"][0] for i in entries):
         raise ValueError(f"--goal: entries of {column} must be 0 to {feature['shape'][0] - 1}, got {text}")
     return column, entries
+
+
+def _choose_steps(lengths: list[int], min_steps: int) -> int:
+    """Return the steps of the pieces for the lengths of all episodes."""
+    enough = [length for length in lengths if length >= min_steps]
+    shortest = int(np.quantile(enough, 0.1, method="lower")) if enough else min_steps
+    return min(max(LONGEST, min_steps), shortest)
 
 
 def _starts(length: int, steps: int) -> list[int]:

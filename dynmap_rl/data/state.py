@@ -94,6 +94,13 @@ def read_state(root: Path, info: dict, state: StateSource) -> Iterator[tuple[int
     """
     table = read_table(root, info, [state.column])
     position = read_column(root, info, table, state.column, np.float64).numpy()[:, state.columns]
+    spans_of = np.ptp(position[:, state.angles], axis=0)
+    for entry, extent in zip(state.angles, spans_of, strict=True):
+        if extent > 1.05 * state.period:
+            raise ValueError(
+                f"angle {state.names[entry]} of {state.column} must stay within --period {state.period:.4g}, but spans "
+                f"{extent:.4g}; give --period 360 for degrees, and leave a continuous angle out of --angles"
+            )
     is_angle = np.isin(np.arange(len(state.columns)), state.angles)
     scale = np.where(is_angle, state.angle_noise, state.noise)
     position += scale * np.random.default_rng(state.seed).standard_normal(position.shape)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 from tensordict import TensorDictBase
 
 from dynmap_rl.data.robot import describe_robot_dataset
@@ -52,7 +53,8 @@ def write_robot_report(
     Returns:
         The content of ``eval.json``. ``held_out`` has means over the seeds: ``rgb`` (root mean square, 0 to 1),
         ``imitation_l1`` (normalised) and, in the dataset's units, the mean absolute error of every entry of the action
-        and of the supervised dynamics, one step ahead. ``spread`` has the mean absolute error of the best constant.
+        and of the supervised dynamics, one step ahead. ``spread`` has the mean absolute error of the best constant, and
+        ``change`` that of the value one step earlier.
 
     Raises:
         ValueError: a seed was evaluated with another world model.
@@ -78,6 +80,7 @@ def write_robot_report(
         "held_out": {"rgb": errors["error_rgb"], "imitation_l1": errors["imitation_l1"]}
         | {q: {n: errors[f"error_{q}_{i}"] for i, n in enumerate(own)} for q, own in names.items()},
         "spread": {q: dict(zip(own, _spread(episodes, q), strict=True)) for q, own in names.items()},
+        "change": {q: dict(zip(own, _change(episodes, q), strict=True)) for q, own in names.items()},
         "settings": settings,
         "command": command,
         "commit": find_commit(),
@@ -100,12 +103,27 @@ def robot_row_text(result: dict) -> str:
         f"  rgb {errors['rgb']:.4f} (root mean square)   imitation L1 {errors['imitation_l1']:.4f} (normalised)",
     ]
     for quantity, constant in result["spread"].items():
-        entries = (f"{n} {error:.3g} ({constant[n]:.3g})" for n, error in errors[quantity].items())
+        simple = [constant, *([result["change"][quantity]] if "change" in result else [])]
+        entries = (
+            f"{n} {error:.3g} ({', '.join(f'{of[n]:.3g}' for of in simple)})"
+            for n, error in errors[quantity].items()
+        )
         lines.append(f"  {quantity:13s} {'   '.join(entries)}")
-    lines.append("  mean absolute errors in the dataset's units, in brackets those of the best constant")
+    lines.append(
+        "  mean absolute errors in the dataset's units, in brackets those of the best constant and "
+        "of the value one step earlier"
+    )
     return "\n".join(lines)
 
 
+def _values(episodes: TensorDictBase, quantity: str) -> torch.Tensor:
+    return episodes["action" if quantity == "action" else ("dynamics", quantity)]
+
+
+def _change(episodes: TensorDictBase, quantity: str) -> list[float]:
+    return _values(episodes, quantity).diff(dim=1).abs().mean((0, 1)).tolist()
+
+
 def _spread(episodes: TensorDictBase, quantity: str) -> list[float]:
-    values = episodes["action" if quantity == "action" else ("dynamics", quantity)].flatten(0, 1)
+    values = _values(episodes, quantity).flatten(0, 1)
     return (values - values.median(0).values).abs().mean(0).tolist()

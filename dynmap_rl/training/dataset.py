@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dynmap_rl.data.cache import hash_content
 from dynmap_rl.data.demonstrations import META, find_layout, find_meta
 from dynmap_rl.data.format.frames import iterate_frames
 from dynmap_rl.data.format.reading import find_dataset, read_column, read_info, read_table
@@ -15,30 +16,46 @@ from dynmap_rl.data.settings import Augmentation
 from dynmap_rl.envs.protocol import BaseTask
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.keys import CAMERAS
+from dynmap_rl.utils.files import read_json, write_json
 
 LEVEL = 30  # difference of a channel, of 0 to 255
 SHARE = 0.025  # of the pixels, for tasks that are not in the plane: graphics libraries draw edges differently
 
 
-def find_or_record(task: str, dataset: str | Path | None = None) -> str | Path:
+def find_or_record(task: str, dataset: str | Path | None = None, run: Path | None = None) -> str | Path:
     """Return the dataset to train on.
 
     Args:
         task: name of the task.
         dataset: folder or hub id; by default ``datasets/TASK``, which is recorded with the shipped expert where it is
             missing.
+        run: folder of the run that is trained on it, which keeps a hash of the dataset.
 
     Raises:
-        ValueError: the dataset is of another task, or of the same task with another camera, scene or goal, or holds no
-            demonstrations.
+        ValueError: the dataset is of another task, or of the same task with another camera, scene or goal, holds no
+            demonstrations, or has changed since the run began.
     """
     folder = Path("datasets") / get_task(task).name
     if dataset is None and not (folder / META).exists():
-        return record_dataset(folder, task)
-    dataset = folder if dataset is None else dataset
-    check_dataset(dataset, task)
-    check_start(dataset, task)
+        dataset = record_dataset(folder, task)
+    else:
+        dataset = folder if dataset is None else dataset
+        check_dataset(dataset, task)
+        check_start(dataset, task)
+    if run is not None:
+        keep_dataset(run, dataset)
     return dataset
+
+
+def keep_dataset(run: Path, dataset: str | Path) -> None:
+    """Store a hash of a run's dataset, or raise ``ValueError`` where the run has begun with other data."""
+    path, found = Path(run) / "dataset.json", {"sha256": hash_content(find_dataset(dataset))}
+    if not path.exists():
+        write_json(path, found)
+    elif read_json(path) != found:
+        raise ValueError(
+            f"{run} was trained on other data than {dataset} holds now; choose another --run, or delete the folder"
+        )
 
 
 def choose_augmentation(task: BaseTask, augmentation: Augmentation, imitated: bool = False) -> Augmentation:

@@ -30,7 +30,7 @@ import pyarrow.parquet as pq
 import torch
 
 from dynmap_rl.data import load_demonstrations, load_meta, sample_windows
-from dynmap_rl.data.format.reading import decode_image
+from dynmap_rl.data.format.images import decode_image
 from dynmap_rl.envs.task import LAYOUT
 from dynmap_rl.keys import CAMERA, CAMERAS
 from dynmap_rl.utils.cli import command_line

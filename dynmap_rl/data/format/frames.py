@@ -12,7 +12,8 @@ import pyarrow as pa
 
 from dynmap_rl.utils.hub import first_line
 
-from .reading import decode_image, image_files, read_file, spans
+from .images import decode_image, image_files
+from .reading import read_file, spans
 
 TOLERANCE = 1e-4  # s between a timestamp and the video's frame, as in LeRobot
 PLACE = "chunk_index", "file_index", "from_timestamp"  # place of an episode in the video files

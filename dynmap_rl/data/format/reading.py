@@ -1,27 +1,23 @@
-"""Reading of LeRobot v3.0 datasets: finding the folder, metadata, columns and images."""
+"""Reading of LeRobot v3.0 datasets: finding the folder, metadata and columns."""
 
 from __future__ import annotations
 
-import io
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from itertools import pairwise
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
-from PIL import Image
 
 from dynmap_rl.utils.files import check_form
 from dynmap_rl.utils.hub import first_line, is_hub_id
 
 LEROBOT_VERSION = "v3.0"
 INFO = {"total_frames": int, "features": {str: {"dtype": str, "shape": [int]}}}
-PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def find_dataset(dataset: str | Path) -> Path:
@@ -118,29 +114,36 @@ def read_split(root: Path, info: dict, name: str) -> range:
     return range(first, end)
 
 
-def choose_splits(root: Path, info: dict, episodes: list[int]) -> dict[str, list[int]]:
+def choose_splits(
+    root: Path, info: dict, episodes: list[int], usable: Container[int] | None = None
+) -> dict[str, list[int]]:
     """Divide episodes into ``train`` and ``eval``.
 
     Args:
         root: folder of the dataset.
-        info: content of its ``meta/info.json``. Splits ``train`` and ``eval`` named there are kept; otherwise every
-            tenth episode is held out, or the last one of fewer than ten.
-        episodes: indices to choose from.
+        info: content of its ``meta/info.json``. Splits named there, ``train`` and ``eval``, ``test`` or ``val``, are
+            kept; otherwise every tenth episode is held out, or the last one of fewer than ten.
+        episodes: indices of all episodes.
+        usable: those that are kept, by default all. What is held out does not depend on it.
 
     Raises:
-        ValueError: there are fewer than two episodes, or named splits are empty or share episodes.
+        ValueError: there are fewer than two episodes, or splits are empty or share episodes.
     """
-    if {"train", "eval"} <= (info.get("splits") or {}).keys():
-        members = {name: read_split(root, info, name) for name in ("train", "eval")}
+    named = info.get("splits") or {}
+    held_out = next((name for name in ("eval", "test", "val") if name in named), None)
+    if "train" in named and held_out:
+        members = {"train": read_split(root, info, "train"), "eval": read_split(root, info, held_out)}
         if shared := sorted(set(members["train"]) & set(members["eval"])):
             raise ValueError(
-                f"the splits train and eval of {root} must not share episodes, got {shared[0]} to {shared[-1]} in both; "
-                "correct meta/info.json"
+                f"the splits train and {held_out} of {root} must not share episodes, got {shared[0]} to {shared[-1]} in "
+                "both; correct meta/info.json"
             )
         splits = {name: [e for e in episodes if e in members[name]] for name in members}
     else:
         held_out = episodes[9::10] or episodes[-1:]
         splits = {"train": [e for e in episodes if e not in held_out], "eval": held_out}
+    if usable is not None:
+        splits = {name: [e for e in members if e in usable] for name, members in splits.items()}
     if not all(splits.values()):
         found = ", ".join(f"{len(members)} in {name}" for name, members in splits.items())
         raise ValueError(
@@ -231,67 +234,24 @@ def read_column(root: Path, info: dict, table: pa.Table, name: str, dtype=np.flo
     while pa.types.is_list(flat.type) or pa.types.is_fixed_size_list(flat.type):
         flat = flat.flatten()
     values = flat.to_numpy(zero_copy_only=False)
-    if values.dtype.kind not in "biuf" or table[name].null_count or not np.isfinite(values).all():
-        raise ValueError(
-            f"{name} of {root} must be finite numbers, got others or missing ones; record it again"
-        )
     size = math.prod(info["features"][name]["shape"]) if name in info["features"] else 1
+    numbers = values.dtype.kind in "biuf" and not table[name].null_count
+    if not numbers or not np.isfinite(values).all():
+        row = int(np.flatnonzero(~np.isfinite(values))[0]) // size if numbers else None
+        where = (
+            f"got {values[row * size : (row + 1) * size].tolist()} in row {row}" if numbers else "got others"
+        )
+        if numbers and "episode_index" in table.column_names:
+            where += f", episode {table['episode_index'][row]}"
+        raise ValueError(
+            f"{name} of {root} must be finite numbers, {where}; correct them, or delete the episode (lerobot-edit-dataset)"
+        )
     if len(values) != size * len(table):
         raise ValueError(f"{name} of {root} must have {size} numbers in every row; record it again")
     return torch.from_numpy(values.astype(bool if values.dtype == bool else dtype)).reshape(-1, size)
-
-
-def image_files(where: Path, name: str, column: pa.ChunkedArray) -> pa.Array:
-    """Return the image files of a camera's column.
-
-    Args:
-        where: dataset or file of the column, for messages.
-        name: the column's name.
-        column: its values.
-
-    Raises:
-        ValueError: the column does not hold files.
-    """
-    array = column.combine_chunks()
-    try:
-        files = array.field("bytes")
-    except (AttributeError, KeyError):
-        files = None
-    if files is None or not pa.types.is_binary(files.type):
-        raise ValueError(f"{name} of {where} must hold image files; restore it or record it again")
-    return files
 
 
 def spans(episode: np.ndarray) -> list[tuple[int, slice]]:
     """Return the index of every episode and its rows."""
     borders = [0, *(np.flatnonzero(np.diff(episode)) + 1).tolist(), len(episode)]
     return [(int(episode[a]), slice(a, b)) for a, b in pairwise(borders)]
-
-
-def decode_image(file: pa.Buffer | None, largest: int) -> np.ndarray:
-    """Decode an image file.
-
-    Args:
-        file: content of the file.
-        largest: largest number of pixels allowed, as a small file can hold a huge picture.
-
-    Returns:
-        uint8 ``[height, width, 3]`` (RGB).
-
-    Raises:
-        ValueError: the file cannot be decoded, or has too many pixels. The message is the end of a sentence.
-    """
-    data = np.frombuffer(file or b"", np.uint8)
-    try:
-        if data[:8].tobytes() == PNG and data.size >= 24:
-            width, height = data[16:24].view(">u4").tolist()
-        else:  # takes as long as decoding a small PNG
-            width, height = Image.open(io.BytesIO(data)).size
-    except (OSError, Image.DecompressionBombError) as error:
-        raise ValueError("cannot be decoded") from error
-    if width * height > largest:
-        raise ValueError(f"must have at most {largest} pixels, got {width} x {height}")
-    frame = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB)
-    if frame is None:
-        raise ValueError("cannot be decoded")
-    return frame
