@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dynmap_rl.data.derive import _derive, differentiate
+from dynmap_rl.data.derive import _derive, align_turns, differentiate
 from dynmap_rl.data.motion import Motion
 
 EVEN = np.arange(20) / 25
@@ -31,6 +31,19 @@ def test_an_angle_in_degrees_jumps_by_360():
     angle = (400 * EVEN[:, None] + 180) % 360 - 180  # 16 in a step, which is not a jump
     found, _ = _derive(Motion(angle, [0], 360), EVEN, "central", 11, 3)
     np.testing.assert_allclose(found["velocity"], 400)
+
+
+def test_a_pose_has_one_angle_in_all_episodes():
+    """Episodes that begin near the border of the measured range, which a gripper that points down does."""
+    true = np.pi + 0.5 * np.sin(np.arange(60) / 5) + np.repeat([0.1, -0.1, 0.05], 20)
+    rows = [slice(0, 20), slice(20, 40), slice(40, 60)]
+    angle = np.concatenate([np.unwrap((true[r] + np.pi) % (2 * np.pi) - np.pi) for r in rows])
+    assert np.ptp(angle - true) > 6
+    align_turns(angle, rows, 2 * np.pi)
+    assert np.ptp(angle - true) < 1e-9
+    degrees = np.array([-170.0, 170.0])
+    align_turns(degrees, [slice(0, 1), slice(1, 2)], 360.0)
+    assert np.ptp(degrees) == pytest.approx(20)
 
 
 def test_the_acceleration_of_a_measured_velocity_is_its_derivative():

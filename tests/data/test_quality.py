@@ -168,3 +168,34 @@ def test_the_worst_episode_is_named_and_a_dataset_is_judged(tmp_path):
         )
     checks = judge_quality(episodes)["checks"]
     assert checks["residual"]["episode"] == 2 and checks["lost"]["value"] == 0
+
+
+def test_an_episode_without_its_object_makes_a_dataset_doubtful():
+    found = np.ones((60, 1), bool)
+    whole = Motion(np.cumsum(np.ones((60, 2)), 0), [], found=found)
+    gone = replace(whole, found=np.arange(60)[:, None] > 50)
+    parts = [
+        Derived(e, ["x", "y"], whole.position, whole.position, gone if e == 7 else whole) for e in range(30)
+    ]
+    quality = judge_quality(parts)
+    assert quality["checks"]["lost"]["good"] and not quality["checks"]["gone"]["good"]
+    assert quality["verdict"] == "doubtful" and quality["checks"]["gone"]["episode"] == 7
+    assert quality["checks"]["gone"]["value"] == pytest.approx(51 / 60)
+
+
+def test_all_episodes_that_cannot_be_tracked_are_named(tmp_path, monkeypatch):
+    from dynmap_rl.data import camera
+
+    root = make_robot_dataset(tmp_path / "robot", (12, 13, 14, 12))
+    measured = camera.measure
+
+    def measure_long(frames, *rest):
+        if len(frames) == 12:
+            raise ValueError("nothing moves")
+        return measured(frames, *rest)
+
+    monkeypatch.setattr(camera, "measure", measure_long)
+    found = read_motion(root, read_info(root), FrameSource("centroid", "observation.images.top"))
+    assert [next(found)[0], next(found)[0]] == [1, 2]
+    with pytest.raises(ValueError, match="in episodes 0, 3 nothing moves"):
+        next(found)

@@ -13,6 +13,13 @@ def test_every_tenth_episode_is_held_out():
     assert splits["eval"] == [9, 19] and splits["train"] == [e for e in range(25) if e not in (9, 19)]
 
 
+def test_what_is_held_out_does_not_depend_on_what_is_left_out():
+    splits = choose_splits(Path(), {}, list(range(25)), usable=set(range(25)) - {3, 9})
+    assert splits["eval"] == [19] and not {3, 9, 19} & {*splits["train"]} and len(splits["train"]) == 22
+    named = {"splits": {"train": "0:3", "test": "3:5"}}
+    assert choose_splits(Path(), named, list(range(5))) == {"train": [0, 1, 2], "eval": [3, 4]}
+
+
 def test_rows_are_in_order_of_time(tmp_path):
     (tmp_path / "data/chunk-000").mkdir(parents=True)
     for number, index in enumerate(([2, 3], [0, 1])):

@@ -4,13 +4,14 @@ import json
 import shutil
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
 from robot_dataset import CAMERA, make_robot_dataset
 
 from dynmap_rl.data.derive import add_dynamics
-from dynmap_rl.data.robot import load_robot_dataset
+from dynmap_rl.data.robot import describe_robot_dataset, load_robot_dataset
 from dynmap_rl.data.windows import sample_windows
 
 LENGTHS = (31, 47, 24, 33)
@@ -96,6 +97,28 @@ def test_episodes_that_are_too_short_are_left_out_and_long_ones_cut(tmp_path):
     assert load_robot_dataset(root, 122)[0]["train"].shape == (2, 122)
     with pytest.raises(ValueError, match="lengths must"):
         load_robot_dataset(root, 128)
+
+
+def test_a_short_take_neither_shortens_the_pieces_nor_changes_what_is_held_out(tmp_path):
+    root = make_robot_dataset(tmp_path / "takes", [12, *range(30, 50)])
+    found = [describe_robot_dataset(root, min_steps=steps) for steps in (10, 24)]
+    assert [one["steps"] for one in found] == [31, 31], "a tenth of 21 episodes may be shorter"
+    assert [one["left_out"] for one in found] == [[0, 1], [0, 1]]
+    assert [one["splits"]["eval"] for one in found] == [[9, 19], [9, 19]]
+    assert load_robot_dataset(root, 10)[0]["eval"].shape == (4, 31)
+
+
+def test_a_number_that_is_missing_is_named_with_its_place(folders, tmp_path):
+    root = shutil.copytree(folders / "dynamics", tmp_path / "broken")
+    [path] = (root / "data").rglob("*.parquet")
+    table = pq.read_table(path)
+    actions = table["action"].to_pylist()
+    actions[40] = [float("nan"), 0.5]
+    at = table.column_names.index("action")
+    field = table.schema.field(at)
+    pq.write_table(table.set_column(at, field, pa.array(actions, field.type)), path)
+    with pytest.raises(ValueError, match=r"action .*nan.* in row 40, episode 1"):
+        load_robot_dataset(root, 20)
 
 
 def test_frames_are_resized_by_area_and_keep_their_colours(splits):

@@ -308,6 +308,7 @@ def test_state_and_tracks_stand_side_by_side_and_are_judged_together(videos, tmp
         ({"noise": -1.0}, "--noise"),
         ({"noise": float("nan")}, "--noise"),
         ({"angles": "2", "period": 0.0}, "--period must be above 0"),
+        ({"angles": "2", "period": 1.0}, "--period 360 for degrees"),
         ({"window": 21}, "--window has no effect with --method central"),
         (
             {"source": "tracks", "method": "central", "order": 4},

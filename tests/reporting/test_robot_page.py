@@ -41,6 +41,8 @@ def test_errors_are_means_over_seeds_beside_those_of_the_best_constant(folder, m
     )
     values = episodes["action"].flatten(0, 1)[:, 1]
     assert result["spread"]["action"]["y"] == pytest.approx((values - values.median()).abs().mean().item())
+    change = episodes["action"][..., 1].diff(dim=1).abs().mean().item()
+    assert result["change"]["action"]["y"] == pytest.approx(change)
     assert result["trained_on"]["held_out_episodes"] == [4, 7] and "task" not in result
     assert read_json(folder / "eval.json")["held_out"] == result["held_out"] and drawn == [0.1]
     assert "0.2000" in robot_row_text(result) and "0.2000" in (folder / "report.html").read_text()

@@ -69,3 +69,13 @@ def test_a_recording_begins_as_the_task_does_now(recording, tmp_path, monkeypatc
     monkeypatch.setattr(type(task), "make_renderer", lambda self: lambda world: np.roll(draw(world), 1, 1))
     with pytest.raises(ValueError, match="first frame of"):
         check_start(recording, TASK)
+
+
+def test_a_run_keeps_a_hash_of_its_data(recording, tmp_path):
+    root, run = shutil.copytree(recording, tmp_path / "demonstrations"), tmp_path / "run"
+    for _ in range(2):
+        assert find_or_record("balance_reaching", root, run) == root
+    info = root / "meta/info.json"
+    info.write_text(info.read_text() + " ")
+    with pytest.raises(ValueError, match="other data than"):
+        find_or_record("balance_reaching", root, run)
