@@ -25,15 +25,16 @@ class ImaginationEnv(ModelBasedEnvBase):
     Every reset begins at ``start``. ``env.reset(other, set_state=True)`` begins once at another TensorDict with the
     same keys. :func:`make_start` makes such a TensorDict from frames. Any TorchRL policy that reads ``latent``,
     ``hidden1``, ``hidden2`` and ``goal`` can act in this environment, for example
-    :class:`dynmap_rl.modules.LatentActor`. Steps are differentiable.
+    :class:`dynmap_rl.modules.LatentActor`, but not :class:`dynmap_rl.modules.Actor`, which encodes frames. Steps are differentiable.
 
     Action: ``action`` float32 ``[B, A]``, in the range of the world model's own actions: dX, dY, dTheta (m, m, rad)
     within the limits of the simulated cart.
 
     Observation ``[B, ...]``: ``latent``, ``predicted_latent`` (equal except at the start), ``hidden1``, ``cell1``,
     ``hidden2``, ``cell2``; ``("predicted_dynamics", quantity)`` (SI units) for each quantity that the world model
-    decodes; with ``decode_pixels`` ``("reconstruction", "pixels")``, float32 in 0..1; and all other entries of
-    ``start``, such as ``goal``, unchanged. There is no prediction of the first frame of an episode: at such a start
+    decodes; with ``decode_pixels`` ``("reconstruction", "pixels")``, float32 in about 0..1, not clipped; and all
+    other entries of ``start``, such as ``goal``: unchanged, or as the policy writes them for the next step, such as its
+    memory. There is no prediction of the first frame of an episode: at such a start
     dynamics and frame are decoded from zeros. TorchRL's ``RenameTransform`` gives the keys other names.
 
     Reward and end: a world model predicts no reward and no end of an episode. ``reward`` is the value of the given
@@ -109,6 +110,8 @@ class ImaginationEnv(ModelBasedEnvBase):
         memory = tuple(tensordict[key] for key in MEMORY)
         latent, memory = self.world_model.step(tensordict["latent"], tensordict["action"], memory)
         td = TensorDict({}, self.batch_size, device=self.device).update(tensordict.select(*self.constant))
+        if "next" in tensordict.keys():  # what a policy has written, such as its memory
+            td.update(tensordict["next"].select(*self.constant, strict=False))
         for key, value in zip(STEP_KEYS, (latent, latent, *memory), strict=True):
             td[key] = value
         td = self._decode(td)
@@ -122,6 +125,12 @@ class ImaginationEnv(ModelBasedEnvBase):
         if self.decode_pixels:
             td["reconstruction", "pixels"] = self.world_model.decode_pixels(*states)
         return td
+
+    def to(self, device):
+        """Move world model, start and specs."""
+        super().to(device)
+        self.start = self.start.to(self.device)
+        return self
 
     def _set_seed(self, seed: int | None) -> None:
         """Do nothing, as nothing is random."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from numbers import Real
@@ -26,8 +27,8 @@ class Scene:
     ``cart_x, cart_y`` is the cart's centre, ``block_shift`` the block's offset from it along the cart.
 
     Raises:
-        ValueError: a size or the density is not positive, a place is not in the picture, or the block's centre is beside
-            the cart.
+        ValueError: a number is not finite, a size or the density not positive, the friction negative, a place not in the
+            picture, or the block's centre beside the cart.
     """
 
     cart_width: float = 0.25
@@ -49,8 +50,11 @@ class Scene:
         for name, value in vars(self).items():
             if name.endswith("_color"):
                 continue
-            if not isinstance(value, Real):
-                raise ValueError(f"{name} of the scene must be a number, got {value!r}")
+            if not isinstance(value, Real) or not math.isfinite(value):
+                raise ValueError(f"{name} of the scene must be a finite number, got {value!r}")
+            object.__setattr__(self, name, float(value))
+            if name == "friction" and value < 0:
+                raise ValueError(f"friction of the scene must be at least 0, got {value}")
             if name.endswith(SIZES) and not value > 0:
                 raise ValueError(f"{name} of the scene must be positive, got {value}")
             if name.endswith(("_x", "_y")) and not 0 <= value <= 1:

@@ -21,7 +21,7 @@ class TaskEnv(gym.Env):
     Observation: dict of ``pixels``, itself a dict with a frame uint8 ``(S, S, 3)`` for each camera, and ``agent_pos``,
     float32, all that a policy may read besides the frames; the goal stands last.
 
-    Info: ``is_success``, in the last step only, ``dropped`` and ``position_error`` (m), as numpy scalars.
+    Info: ``is_success`` (bool), in the last step only, ``dropped`` (bool) and ``position_error`` (float32, m).
 
     End: the episode is truncated after the steps of the layout, and terminates where the task says that it has failed.
 

@@ -127,7 +127,9 @@ class DynmapBatchedEnv(EnvBase):
         **kwargs,
     ) -> TensorDictBase:
         if kwargs:
-            raise TypeError(f"reset takes seed and scene_seed, got {', '.join(sorted(kwargs))}")
+            raise TypeError(
+                f"reset takes scene_seed, got {', '.join(sorted(kwargs))}; a seed goes to set_seed"
+            )
         n = self.batch_size[0]
         mask = torch.ones(n, dtype=torch.bool)
         seeds = scene_seed

@@ -114,9 +114,8 @@ class World:
             shape.friction = 1.0
             shape.collision_type = WALL
             self.space.add(shape)
-        touched = self.touched
-        self.space.on_collision(CART, WALL, begin=lambda *_: touched.add("cart"))
-        self.space.on_collision(BLOCK, WALL, begin=lambda *_: touched.add("block"))
+        self.space.on_collision(CART, WALL, begin=_touch, data={"touched": self.touched, "name": "cart"})
+        self.space.on_collision(BLOCK, WALL, begin=_touch, data={"touched": self.touched, "name": "block"})
 
     def step(self, action: np.ndarray) -> None:
         """Simulate one control step of 50 ms with the position-update action ``(dX, dY, dTheta)`` (m, m, rad).
@@ -172,6 +171,11 @@ class World:
         """Mean distance of cart and goal over the last 10 steps (m), PE in the paper."""
         last = self.errors[max(1, len(self.errors) - FINAL_STEPS) :] or self.errors
         return sum(last) / len(last)
+
+
+def _touch(arbiter, space, data: dict) -> None:
+    """Record a contact; a function of the module, so that copies of a world have records of their own."""
+    data["touched"].add(data["name"])
 
 
 def step_worlds(worlds: Sequence[World], actions: Sequence[np.ndarray]) -> None:

@@ -154,7 +154,8 @@ class DelayedActor(TensorDictModuleBase):
                 f"{self.delay_key} must be int64 {list(pixels.shape[:-3])}, a delay for each frame, "
                 f"got {delay.dtype} {list(delay.shape)}"
             )
-        used = ((delay >= 0) & (delay <= step.clamp(max=self.max_delay))).nonzero(as_tuple=True)
+        later = (delay[..., :, None] == delay[..., None, :]).triu(1).any(-1)  # frames of the same step
+        used = ((delay >= 0) & (delay <= step.clamp(max=self.max_delay)) & ~later).nonzero(as_tuple=True)
         if used[0].numel():
             place = (*used[:-1], self.max_delay - delay[used])
             history["latent"][place] = self.world_model.encode(pixels[used], self.actor.mixed)

@@ -109,7 +109,7 @@ class WorldModel(nn.Module):
         return self.transition.lstm.initial_state(batch, device)
 
     def decode_pixels(self, predicted_latent, hidden1, hidden2) -> torch.Tensor:
-        """Decode predicted frames ``[..., 3, S, cameras * S]`` in 0..1."""
+        """Decode predicted frames ``[..., 3, S, cameras * S]`` in about 0..1, not clipped."""
         return self.image_decoder(predicted_latent, hidden1, hidden2)
 
     def decode_dynamics(self, predicted_latent, hidden1, hidden2) -> dict[str, torch.Tensor]:

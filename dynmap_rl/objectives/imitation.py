@@ -128,7 +128,7 @@ class ImitationLoss(LossModule):
         """Keys that the loss writes."""
         return ["loss_policy"]
 
-    @dispatch
+    @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Return the loss."""
         check_windows(tensordict)

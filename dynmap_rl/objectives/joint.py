@@ -95,7 +95,7 @@ class JointLoss(LossModule):
         """Keys that the loss writes; their sum is to be minimised."""
         return [*([] if self.end_to_end else self.world_model_loss.out_keys), "loss_policy"]
 
-    @dispatch
+    @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Return the losses."""
         check_windows(tensordict, steps=1 if self.end_to_end else 2)

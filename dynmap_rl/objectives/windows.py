@@ -15,6 +15,8 @@ def check_windows(tensordict: TensorDictBase, steps: int = 1) -> None:
     Raises:
         ValueError: there are more or fewer batch axes, too few steps, or ``is_init`` after a first step.
     """
+    if not tensordict.ndim:  # a loss was called with tensors
+        tensordict.auto_batch_size_(2)
     shape = list(tensordict.shape)
     if len(shape) != 2 or shape[1] < steps:
         raise ValueError(

@@ -95,7 +95,7 @@ class WorldModelLoss(LossModule):
         first = ("rgb", "latent") if self.beta_rgb else ("latent",)
         return [f"loss_{name}" for name in (*first, *self.world_model.supervision)]
 
-    @dispatch
+    @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Return the losses."""
         check_windows(tensordict, steps=2)
@@ -147,6 +147,9 @@ class WorldModelLoss(LossModule):
         for name, value in model.decode_dynamics(predicted, hidden1, hidden2).items():
             scale = model.dynamics_decoder.normalizers[name].scale
             truth = tensordict[unravel_key((keys.dynamics, name))][:, 1:]
+            for mask in (known, *masks.values(True, True)):
+                if mask is not None:  # unknown entries may be NaN, whose gradient no mask stops
+                    truth = torch.where(mask.reshape(*truth.shape[:2], 1), truth, value.detach())
             losses[f"loss_{name}"] = self.beta_dynamics * self._mean(
                 rms((value - truth) / scale), masks, known
             )

@@ -166,3 +166,19 @@ def test_a_step_of_a_rollout_is_a_start():
     imagined = ImaginationEnv(make_model(), step)
     check_env_specs(imagined)
     torch.testing.assert_close(imagined.reset()["hidden1"], step["hidden1"])
+
+
+@torch.no_grad()
+def test_a_recurrent_policy_goes_on_with_its_memory_from_a_step_of_a_rollout(frames):
+    model = make_model()
+    actor = LatentActor(make_policy(CONSTANTS, "recurrent", model, width=20))
+    primed = Compose(InitTracker(), actor.make_tensordict_primer())
+    out = TransformedEnv(ImaginationEnv(model, make_start(model, frames)), primed).rollout(6, actor)
+    rest = ImaginationEnv(model, out[:, 3].exclude("action")).rollout(3, actor)
+    torch.testing.assert_close(rest["action"], out["action"][:, 3:], rtol=1e-3, atol=1e-6)
+
+
+def test_the_start_moves_with_the_environment(frames):
+    env = ImaginationEnv(make_model(), make_start(make_model(), frames))
+    env.action_spec = env.observation_spec["latent"].clone()  # bounds cannot be checked without values
+    assert env.to("meta") is env and env.start.device == torch.device("meta")

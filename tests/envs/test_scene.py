@@ -1,5 +1,6 @@
 """Scenes: drawn from their ranges, determined by the seed, every factor fixable."""
 
+import math
 from dataclasses import fields
 from itertools import pairwise
 
@@ -147,10 +148,26 @@ def test_impossible_scene_raises(kind, factor):
         kind(**factor)
 
 
-@pytest.mark.parametrize("factor", [{"goal_x": 7.0}, {"cart_y": -0.1}, {"goal_x": "0.7"}, {"density": None}])
+@pytest.mark.parametrize(
+    "factor",
+    [
+        {"goal_x": 7.0},
+        {"cart_y": -0.1},
+        {"goal_x": "0.7"},
+        {"density": None},
+        {"density": math.inf},
+        {"friction": -1.0},
+        {"block_shift": math.nan},
+    ],
+)
 def test_impossible_factors_are_refused(factor):
     with pytest.raises(ValueError, match=next(iter(factor))):
         Scene().replace(**factor)
+
+
+def test_numbers_of_numpy_are_numbers():
+    scene = Scene().replace(goal_x=np.float32(0.5))
+    assert scene == Scene(goal_x=0.5) and type(scene.goal_x) is float
 
 
 def test_ranges_are_ranges():

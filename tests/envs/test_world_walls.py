@@ -1,5 +1,8 @@
 """Walls: they stop the block, the cart passes, and every touch is noticed."""
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 from pymunk import Vec2d
@@ -137,3 +140,13 @@ def test_mirrored_collision_is_mirrored():
     left[:, [0, 3]] += 1
     np.testing.assert_allclose(left, right, atol=0.01)
     assert right[-1, 5] > 0.5
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda world: pickle.loads(pickle.dumps(world))])
+def test_a_copy_has_touches_of_its_own(copied):
+    world = World(SCENE, [AT_THE_BLOCK, AT_THE_CART])
+    other = copied(world)
+    drive(other, to_the_right())
+    assert other.touched == {"cart", "block"} and world.touched == set()
+    drive(world, to_the_right())
+    assert world.touched == other.touched

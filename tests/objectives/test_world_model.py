@@ -94,6 +94,30 @@ def test_the_loss_of_the_dynamics_is_the_mean_over_the_labelled_steps():
     assert none["loss_position"] == 0 and none["loss_latent"] == found["loss_latent"]
 
 
+@pytest.mark.parametrize("mask", ["labelled", ("collector", "mask")])
+def test_unknown_dynamics_may_be_nan(mask):
+    td, (_, loss) = batch(), make(("position",))
+    td[mask] = torch.rand(2, 5, 1) > 0.4 if mask == "labelled" else torch.rand(2, 5) > 0.4
+    losses = []
+    for value in (0.0, torch.nan):
+        known = td[mask].reshape(2, 5, 1)
+        td["dynamics", "position"] = td["dynamics", "position"].where(known, torch.tensor(value))
+        loss.zero_grad()
+        losses.append(loss(td)["loss_position"])
+        losses[-1].backward()
+        assert all(p.grad.isfinite().all() for p in loss.parameters() if p.grad is not None)
+    assert losses[0] == losses[1]
+
+
+def test_a_call_with_tensors_is_that_with_a_tensordict():
+    td, (_, loss) = batch(t=6), make(())
+    torch.manual_seed(0)
+    expected = [value for _, value in loss(td).items()]
+    torch.manual_seed(0)
+    found = loss(pixels=td["pixels"], action=td["action"])
+    assert all(torch.equal(*pair) for pair in zip(found, expected, strict=True))
+
+
 def test_labels_belong_to_their_own_step():
     td, (_, loss) = batch(), make(("position",))
     td["labelled"] = (torch.arange(5) == 2).expand(2, 5)[..., None]
