@@ -30,25 +30,27 @@ class RobotActor:
     than ``max_delay`` steps are not used.
 
     A call may be late by up to three quarters of a period. Where it is later, control steps were missed, which count as
-    steps with an action of zero; after a longer gap than ``max_delay`` steps, the robot is at rest, and only the last
-    ``max_delay`` of them count.
+    steps with an action of zero, or with the last one again (``hold``); after a longer gap than ``max_delay`` steps, the
+    robot is at rest, and only the last ``max_delay`` of them count.
 
     Args:
         actor: world model and policy; its ``max_delay`` is the age of the oldest frames that are used.
         period: duration of a control step, in the unit of the timestamps (s).
+        hold: whether a missed step repeats the last action, as a robot does whose actions are targets; those of cart and
+            block are changes, which end.
 
     Raises:
         ValueError: ``period`` is not positive, or ``max_delay`` is 0, so that no late frame would be used.
     """
 
-    def __init__(self, actor: DelayedActor, period: float = 0.05):
+    def __init__(self, actor: DelayedActor, period: float = 0.05, hold: bool = False):
         if actor.max_delay < 1:
             raise ValueError(
                 "actor must have a max_delay of at least 1 step; give DelayedActor max_delay=..."
             )
         if not period > 0:
             raise ValueError(f"period must be positive, got {period}")
-        self.actor, self.period = actor.eval(), period
+        self.actor, self.period, self.hold = actor.eval(), period, hold
         self.device = next(actor.parameters()).device
         self.goal = None
 
@@ -99,8 +101,8 @@ class RobotActor:
             raise ValueError("the first action needs a frame; call observe before act")
         self.times.append(now)
         td = self.actor(self._receive())
-        self.memory = td["next"]
-        return td[self.actor.actor.action].cpu().numpy()
+        self.memory, self.action = td["next"], td[self.actor.actor.action]
+        return self.action.cpu().numpy()
 
     def _check_reset(self) -> None:
         if self.goal is None:
@@ -140,8 +142,8 @@ class RobotActor:
         for i in range(max(1, steps - self.actor.max_delay), steps):
             self.times.append(last + i * (now - last) / steps)
             td = self.actor.observe(self.memory.copy())
-            size = self.actor.world_model.transition.action.size
-            td = self.actor.predict(td.set(self.actor.actor.action, torch.zeros(size)))
+            action = self.action if self.hold else torch.zeros_like(self.action)
+            td = self.actor.predict(td.set(self.actor.actor.action, action))
             # Without an action, the policy's memory stays as it is.
             self.memory.update(td["next"])
         self.step += steps

@@ -81,10 +81,11 @@ def test_frames_that_are_too_old_are_not_used():
 
 
 @torch.no_grad()
-def test_missed_steps_have_no_action():
-    robot = make_robot()
+@pytest.mark.parametrize("hold", [False, True])
+def test_missed_steps_have_no_action_or_the_last_one(hold):
+    robot = make_robot(hold=hold)
     robot.observe(FRAMES[0], 0.0)
-    robot.act(0.0)
+    before = torch.from_numpy(robot.act(0.0))
     robot.observe(FRAMES[2], 0.1)
     action = robot.act(0.15)
 
@@ -92,7 +93,7 @@ def test_missed_steps_have_no_action():
     first = actor(TensorDict({"goal": goal, "pixels": torch.from_numpy(FRAMES[0]).movedim(-1, 0)}))["next"]
     memory = first.clone()
     for _ in range(2):
-        td = actor.predict(actor.observe(memory.clone()).set("action", torch.zeros(3)))
+        td = actor.predict(actor.observe(memory.clone()).set("action", before if hold else torch.zeros(3)))
         memory = td["next"].update(first.select(*actor.actor.latent_actor.policy_memory))
     pixels = torch.from_numpy(FRAMES[2]).movedim(-1, 0)
     td = actor(memory.update({"goal": goal, "pixels": pixels, "delay": torch.tensor([1])}))
