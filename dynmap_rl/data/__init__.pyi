@@ -5,6 +5,7 @@ from .demonstrations import load_meta as load_meta
 from .derive import add_dynamics as add_dynamics
 from .derive import differentiate as differentiate
 from .features import compute_features as compute_features
+from .format.frames import join_views as join_views
 from .format.hub import push_dataset as push_dataset
 from .normalization import normalization_constants as normalization_constants
 from .recording.record import record_dataset as record_dataset

@@ -11,6 +11,8 @@ import torch
 from robot_dataset import CAMERA, make_robot_dataset
 
 from dynmap_rl.data.derive import add_dynamics
+from dynmap_rl.data.format.frames import join_views
+from dynmap_rl.data.format.images import decode_image
 from dynmap_rl.data.robot import describe_robot_dataset, load_robot_dataset
 from dynmap_rl.data.windows import sample_windows
 
@@ -141,6 +143,14 @@ def test_frames_of_several_cameras_and_another_size_stand_side_by_side(folders, 
     assert (reduced - left[0]).abs().mean() < 4
     with pytest.raises(ValueError, match="--camera must be one of"):
         load_robot_dataset(folders / "dynamics", 20, f"{CAMERA},front")
+
+
+def test_views_of_a_robot_are_joined_as_for_training(folders):
+    train = load_robot_dataset(folders / "dynamics", 20, f"{CAMERA},{CAMERA}", image_size=32)[0]["train"]
+    [path] = (folders / "dynamics/data").rglob("*.parquet")
+    picture = decode_image(pa.py_buffer(pq.read_table(path)[CAMERA][0].as_py()["bytes"]), 96 * 128)
+    frame = join_views([picture, picture], 32)
+    assert torch.equal(torch.from_numpy(frame).movedim(-1, 0), train["pixels"][0, 0])
 
 
 def test_videos_give_nearly_the_frames_of_images(folders, splits):

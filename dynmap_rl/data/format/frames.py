@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -130,6 +130,19 @@ def _decode_video(
             reason = first_line(error)
             raise ValueError(f"{path} cannot be decoded ({reason}); restore the dataset") from error
         yield frames.permute(0, 2, 3, 1).numpy()
+
+
+def join_views(views: Sequence[np.ndarray], image_size: int = 64) -> np.ndarray:
+    """Resize the pictures of a robot's cameras as for training, and join them side by side.
+
+    Args:
+        views: a picture of each camera, uint8 ``[height, width, 3]`` (RGB), in the order of ``--camera``.
+        image_size: S, side of the frames of the training.
+
+    Returns:
+        uint8 ``[S, cameras * S, 3]``, the frame that :class:`dynmap_rl.modules.RobotActor` takes.
+    """
+    return np.concatenate([_resize(view, (image_size, image_size)) for view in views], 1)
 
 
 def _reduced(frame: np.ndarray, widest: int | None) -> tuple[int, int]:
