@@ -116,7 +116,9 @@ def load_world_models(runs: list[str]) -> dict:
     for run in dict.fromkeys(run.strip().rstrip("/") for run in runs):
         world_model, origin = load_world_model_of(run)
         if "task" not in origin or world_model.transition.action.size != len(ACTION_LIMIT):
-            raise ValueError(f"--runs must be of tasks 1 to 3, got {run}")
+            raise ValueError(
+                f"--runs must be of tasks 1 to 3, got {run}; recipes/robot.py judges its world models itself"
+            )
         row = f"{row_name(world_model.supervision, origin['training'])}, {origin['training']}"
         if world_model.architecture != "glimpse":
             row += f", {world_model.architecture}"
@@ -130,6 +132,8 @@ def load_world_models(runs: list[str]) -> dict:
 
 def describe(open_loop: dict, probes: dict, perception: dict, verdicts: dict, seconds: float) -> str:
     """Return the results as lines of text."""
+    from dynmap_rl.evaluation.probing import judged_text
+
     lines = []
     for name, errors in open_loop.items():
         last = {key: values[-1] for key, values in errors["model"].items()}
@@ -148,9 +152,7 @@ def describe(open_loop: dict, probes: dict, perception: dict, verdicts: dict, se
             values = "  ".join(f"{q} {sum(r2) / len(r2):5.2f}" for q, r2 in quantities.items())
             lines.append(f"{name}: R^2 of {state:8} {values}")
     for name, found in verdicts.items():
-        lines.append(
-            f"{name}: {found['verdict']}; a linear map of {found['state']} explains {found['r2']:.2f} of the velocities"
-        )
+        lines.append(f"{name}: {judged_text(found)}")
     return "\n".join(lines)
 
 

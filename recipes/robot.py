@@ -104,17 +104,20 @@ def main(config: Config) -> None:
     if config.method == "joint":
         parts = config.world_model, config.policy, config.joint
         world_model = train_seeds(load, folder, *parts, by_entry=True, **common)
+        judged = judge_world_model(world_model, episodes)
     else:
         seed_everything(config.world_model.seed)
         world_model = build_world_model(constants, config.world_model, episodes["train"]).to(device)
         settings = config.world_model
         train_world_model(world_model, episodes, folder, settings, logger=config.logger, by_entry=True)
+        judged = judge_world_model(world_model, episodes)
         fingerprint = train_policies(world_model, episodes, constants, folder, config.policy, **common)
     result = write_robot_report(
         folder, world_model, episodes["eval"], seeds,
         dataset=config.dataset, camera=config.camera, goal=config.goal, policy=config.policy.kind,
         origin={"training": config.method, "dataset": config.dataset},
         settings=plain_settings(config), command=command_line(sys.argv), frozen=fingerprint,
+        judged=judged,
     )  # fmt: skip
     print(f"\n{robot_row_text(result)}\nwritten: {folder}")
 
@@ -154,6 +157,18 @@ def describe_pieces(data: dict) -> str:
     if data["info"].get("total_tasks", 1) > 1 and not data["goal"]:
         text += "\nthe dataset has several tasks, which a policy without --goal cannot tell apart"
     return text
+
+
+def judge_world_model(world_model, episodes: dict) -> dict | None:
+    """Judge a world model by linear maps to the dynamics, and print the verdict; None for a dataset without dynamics."""
+    from dynmap_rl.evaluation.probing import judge_states, judged_text, probe
+    from dynmap_rl.keys import DYNAMICS
+
+    if any(("dynamics", quantity) not in episodes["eval"].keys(True) for quantity in DYNAMICS):
+        return None
+    judged = judge_states(probe(world_model, episodes["train"][:100], episodes["eval"]))
+    print(f"world model: {judged_text(judged)}")
+    return judged
 
 
 def default_folder(config: Config) -> Path:

@@ -27,7 +27,7 @@ def probe(world_model: WorldModel, train: TensorDictBase, test: TensorDictBase) 
     Returns:
         For each of ``latent``, ``hidden1``, ``hidden2`` and each quantity a list of R^2, one for each entry (cart x, y,
         theta, block x, y, theta): 1 is a perfect map, 0 as good as the mean. Steps t = 0, at which memory is empty, are
-        left out.
+        left out. R^2 of an entry that rests in the test episodes is NaN.
     """
     inputs = [_states(world_model, episodes) for episodes in (train, test)]
     targets = [
@@ -51,11 +51,21 @@ def judge_states(probed: dict[str, dict]) -> dict:
         probed: result of :func:`probe`.
 
     Returns:
-        ``verdict`` (``good`` from an R^2 of 0.75 on, or ``doubtful``), the best ``state``, and its mean ``r2``.
+        ``verdict`` (``good`` from an R^2 of 0.75 on, or ``doubtful``), the best ``state``, and its mean ``r2`` over the
+        entries that move.
     """
-    means = {state: sum(found["velocity"]) / len(found["velocity"]) for state, found in probed.items()}
+    means = {
+        state: torch.tensor(found["velocity"]).nanmean().nan_to_num(-torch.inf).item()
+        for state, found in probed.items()
+    }
     state = max(means, key=means.get)
     return {"verdict": "good" if means[state] >= GOOD else "doubtful", "state": state, "r2": means[state]}
+
+
+def judged_text(judged: dict) -> str:
+    """Return the result of :func:`judge_states` as text."""
+    verdict, state, r2 = (judged[key] for key in ("verdict", "state", "r2"))
+    return f"{verdict}; a linear map of {state} explains {r2:.2f} of the velocities"
 
 
 def _states(world_model: WorldModel, episodes: TensorDictBase) -> dict[str, torch.Tensor]:
@@ -69,4 +79,5 @@ def _explained(x: torch.Tensor, x_test: torch.Tensor, y: torch.Tensor, y_test: t
     # This driver accepts constant states too.
     weights = torch.linalg.lstsq(x - mean, y - center, driver="gelsd").solution
     rest = y_test - center - (x_test - mean) @ weights
-    return 1 - rest.square().sum(0) / (y_test - y_test.mean(0)).square().sum(0)
+    total = (y_test - y_test.mean(0)).square().sum(0)
+    return 1 - rest.square().sum(0) / total.where(total > 0, torch.nan)

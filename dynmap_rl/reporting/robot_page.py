@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDictBase
 
 from dynmap_rl.data.robot import describe_robot_dataset
+from dynmap_rl.evaluation.probing import judged_text
 from dynmap_rl.modules.supervision import row_name
 from dynmap_rl.modules.world_model import WorldModel
 from dynmap_rl.utils.files import write_json
@@ -33,6 +34,7 @@ def write_robot_report(
     settings: dict,
     command: str,
     frozen: str | None = None,
+    judged: dict | None = None,
 ) -> dict:
     """Collect the results of all seeds, draw a figure, and write ``eval.json`` and ``report.html``.
 
@@ -49,6 +51,7 @@ def write_robot_report(
         settings: settings of the run, as a nested dict of JSON values.
         command: command that started the run.
         frozen: fingerprint of the frozen world model; None where every seed has a world model of its own.
+        judged: result of :func:`dynmap_rl.evaluation.probing.judge_states` on the world model, or None.
 
     Returns:
         The content of ``eval.json``. ``held_out`` has means over the seeds: ``rgb`` (root mean square, 0 to 1),
@@ -77,6 +80,7 @@ def write_robot_report(
         "world_model": origin,
         "seeds": list(seeds),
         "world_model_sha256": frozen,
+        "judged": judged,
         "held_out": {"rgb": errors["error_rgb"], "imitation_l1": errors["imitation_l1"]}
         | {q: {n: errors[f"error_{q}_{i}"] for i, n in enumerate(own)} for q, own in names.items()},
         "spread": {q: dict(zip(own, _spread(episodes, q), strict=True)) for q, own in names.items()},
@@ -109,6 +113,8 @@ def robot_row_text(result: dict) -> str:
             for n, error in errors[quantity].items()
         )
         lines.append(f"  {quantity:13s} {'   '.join(entries)}")
+    if result.get("judged"):
+        lines.append(f"  world model: {judged_text(result['judged'])}")
     lines.append(
         "  mean absolute errors in the dataset's units, in brackets those of the best constant and "
         "of the value one step earlier"

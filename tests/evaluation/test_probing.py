@@ -1,5 +1,7 @@
 """Linear probes of states whose relation to the dynamics is known."""
 
+import math
+
 import torch
 from small import make_episodes
 
@@ -21,6 +23,10 @@ def test_r2_of_linear_independent_and_constant_states(monkeypatch):
     assert min(r2["latent"]["position"]) > 0.999
     assert max(r2["hidden1"]["velocity"]) < 0.1
     assert max(r2["hidden2"]["velocity"]) < 1e-9, "a constant is no better than the mean"
+    episodes["dynamics", "velocity"][..., 2] = 0.5
+    resting = probing.probe(None, episodes[:30], episodes[30:])
+    assert math.isnan(resting["latent"]["velocity"][2])
+    assert math.isfinite(probing.judge_states(resting)["r2"])
 
 
 def test_the_best_state_decides():

@@ -1,8 +1,10 @@
 """Training on a robot dataset as a command, decoupled and jointly."""
 
+import shutil
+
 import pytest
 import torch
-from commands import run, run_small
+from commands import PRESETS, run, run_small
 from robot_dataset import make_robot_dataset
 
 from dynmap_rl.data.derive import add_dynamics
@@ -37,7 +39,8 @@ SIZES = ["--joint.updates=4", "--joint.windows=2", "--joint.window_steps=6", "--
     ("method", "arguments", "goal"), [("decoupled", [], 0), ("joint", JOINT + UNDO + SIZES, 2)]
 )
 def test_a_run_measures_held_out_errors(datasets, tmp_path, method, arguments, goal):
-    arguments = "--dataset", datasets / "gliding", *arguments
+    dataset = shutil.copytree(datasets / "gliding", tmp_path / "gliding")
+    arguments = "--dataset", dataset, *arguments
     result = run_small(tmp_path, "robot", *arguments)
     assert "RGB+[P+V], " in result.stdout
     [folder] = (tmp_path / "runs/robot/gliding").iterdir()
@@ -47,7 +50,9 @@ def test_a_run_measures_held_out_errors(datasets, tmp_path, method, arguments, g
     assert held_out["velocity"].keys() == {"x", "y", "angle"} and held_out["action"].keys() == {"vx", "vy"}
     assert evaluation["spread"].keys() == {"position", "velocity", "action"}
     assert evaluation["trained_on"]["held_out_episodes"] == [2]
-    assert evaluation["world_model"] == {"training": method, "dataset": str(datasets / "gliding")}
+    assert evaluation["judged"]["verdict"] in ("good", "doubtful") and "world model: " in result.stdout
+    assert "held out: episodes 2" in result.stdout
+    assert evaluation["world_model"] == {"training": method, "dataset": str(dataset)}
     settings = evaluation["settings"]["joint" if method == "joint" else "world_model"]
     assert settings["augmentation"] == {"recolor": False, "mirror": False, "max_shift": 0}
     assert evaluation["settings"]["policy"]["emphasis"] == 0, "the preset sets other options of that group"
@@ -60,6 +65,11 @@ def test_a_run_measures_held_out_errors(datasets, tmp_path, method, arguments, g
     assert world_model.decode_dynamics(latent, hidden1, hidden2)["position"].shape == (1, 2, 3)
     again = run_small(tmp_path, "robot", *arguments)
     assert "complete" in again.stdout and result.stdout.split("\n")[1] in again.stdout
+
+    shutil.rmtree(dataset)
+    add_dynamics(datasets / "plain", dataset, columns=[1, 0, 2], angles=[2])
+    other = run(tmp_path, "robot", "--config_path", PRESETS / "robot.yaml", *arguments)
+    assert other.returncode == 2 and "other data than" in other.stderr
 
     closed_loop = run(tmp_path, "evaluate", "--policy", folder)
     assert closed_loop.returncode == 2 and "gliding" in closed_loop.stderr, "there is no simulator"
