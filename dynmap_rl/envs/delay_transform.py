@@ -66,8 +66,9 @@ class DelayTransform(Transform):
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         pixels = self._frames_of(tensordict_reset)
-        if self._frames is None:
-            self._start(pixels)
+        ring = self._frames
+        if ring is None or (ring.shape[1:], ring.device) != (pixels.shape, pixels.device):
+            self._start(pixels)  # also where a used transform gets another environment or device
         mask = tensordict.get("_reset", torch.ones(len(pixels), dtype=torch.bool)).flatten()
         slot = self._now % len(self._frames)
         self._arrival[:, mask], self._taken[mask], self._began[mask] = NEVER, NEVER, self._now

@@ -49,6 +49,14 @@ def test_specs(delay, bursts):
     assert td["delay"].shape == (3, 3, *(places or (1,)))
 
 
+def test_a_used_transform_serves_an_environment_of_another_size():
+    used = make_env()
+    used.rollout(3)
+    fewer = DynmapBatchedEnv(num_envs=2, from_pixels=True, seed=0)
+    again = TransformedEnv(fewer, used.transform.clone()).rollout(5)
+    assert torch.equal(again["delay"], make_env(num_envs=2).rollout(5)["delay"])
+
+
 def test_frames_are_those_of_the_steps_that_the_delays_name():
     on_time = play(DynmapBatchedEnv(num_envs=3, from_pixels=True))["pixels"]
     newest, bursts = play(make_env()), play(make_env(bursts=True))
