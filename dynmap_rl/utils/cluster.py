@@ -7,8 +7,6 @@ from collections.abc import Callable, Iterator, Sequence
 from importlib.util import find_spec
 
 LAUNCHERS = "local", "ray"
-# Under `uv run`, Ray would copy the working directory and install it once more for every worker. Read as Ray is imported.
-os.environ.setdefault("RAY_ENABLE_UV_RUN_RUNTIME_ENV", "0")
 
 
 def check_launcher(launcher: str) -> None:
@@ -20,10 +18,17 @@ def check_launcher(launcher: str) -> None:
 
 
 def connect() -> None:
-    """Connect to the Ray cluster of ``RAY_ADDRESS``, or to one on this machine, started where there is none."""
+    """Connect to the Ray cluster of ``RAY_ADDRESS``, or to one on this machine, started where there is none.
+
+    Workers have the Python environment of the cluster, also under ``uv run``, where Ray would copy the working directory and
+    install it once more for every worker. ``RAY_ENABLE_UV_RUN_RUNTIME_ENV=1`` asks for that.
+    """
     import ray
+    from ray._private import ray_constants  # TorchRL may have imported Ray, which reads the variable then
 
     if not ray.is_initialized():
+        if "RAY_ENABLE_UV_RUN_RUNTIME_ENV" not in os.environ:
+            ray_constants.RAY_ENABLE_UV_RUN_RUNTIME_ENV = False
         ray.init(log_to_driver=False, logging_level="ERROR")
 
 

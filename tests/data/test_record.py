@@ -39,7 +39,7 @@ def test_a_killed_recording_goes_on_to_the_same_dataset(recording, tmp_path, mon
     workers = children_of(process.pid)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + 60  # s; the machine may be busy
     while any(is_running(pid) for pid in workers):
         assert time.monotonic() < deadline, "a worker outlived its parent"
         time.sleep(0.05)

@@ -10,6 +10,8 @@ from dynmap_rl.utils.cluster import run_by_ray
 
 @pytest.mark.slow
 def test_workers_have_the_environment_and_folder_of_the_command_and_raise_its_errors(ray):
+    pytest.importorskip("torchrl.envs")  # imports Ray, which reads its settings then
+
     def describe(number):
         if number == 2:
             raise ValueError("two")
