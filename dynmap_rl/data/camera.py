@@ -148,10 +148,12 @@ def read_motion(root: Path, info: dict, camera: FrameSource) -> Iterator[tuple[i
         except ValueError as error:
             failed.setdefault(str(error), []).append(episode)
     if failed:
-        raise ValueError(f"{root}: {'; '.join(f'in {_number(e)} {text}' for text, e in failed.items())}")
+        raise ValueError(
+            f"{root}: {'; '.join(f'in {_name_episodes(e)} {text}' for text, e in failed.items())}"
+        )
 
 
-def _number(episodes: list[int]) -> str:
+def _name_episodes(episodes: list[int]) -> str:
     """Return episodes as text."""
     return f"episode{'s' * (len(episodes) > 1)} {', '.join(map(str, episodes))}"
 
