@@ -157,6 +157,7 @@ def report(config: Config, dataset: str | Path, folder: Path, seeds: list[int]) 
     from dynmap_rl.reporting.media import film_policy
     from dynmap_rl.reporting.run_page import read_results, row_text
     from dynmap_rl.runs.folder import plain_settings
+    from dynmap_rl.utils.devices import device_name
     from dynmap_rl.utils.files import write_json
     from dynmap_rl.utils.version import find_commit
 
@@ -175,6 +176,7 @@ def report(config: Config, dataset: str | Path, folder: Path, seeds: list[int]) 
         "settings": settings,
         "command": command,
         "commit": find_commit(),
+        "device": device_name(config.compute.device),
         "results": results,
     }
     actor = load(config, folder / f"seed_{seeds[0]}", "cpu")

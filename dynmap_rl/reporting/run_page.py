@@ -16,6 +16,7 @@ from dynmap_rl.modules.actor import Actor
 from dynmap_rl.modules.checkpoints import load_policy
 from dynmap_rl.modules.supervision import row_name
 from dynmap_rl.modules.world_model import WorldModel
+from dynmap_rl.utils.devices import device_name
 from dynmap_rl.utils.files import read_json, write_json
 from dynmap_rl.utils.version import find_commit
 
@@ -53,7 +54,7 @@ def write_report(
         dataset: demonstrations that the policies were trained on, a folder or a hub id.
         policy: kind of the policies, ``feedforward`` or ``recurrent``.
         origin: origin of the world model, with ``task`` and ``training`` (decoupled, joint or end_to_end).
-        settings: settings of the run, as a nested dict of JSON values.
+        settings: settings of the run, as a nested dict of JSON values; ``compute.device`` is its device.
         command: command that started the run.
         frozen: fingerprint of the frozen world model; None where every seed has a world model of its own.
         compare: function from the result to published numbers for the same row (see :func:`row_text`), or to None.
@@ -81,6 +82,7 @@ def write_report(
         "settings": settings,
         "command": command,
         "commit": find_commit(),
+        "device": device_name(settings.get("compute", {}).get("device", "auto")),
         "results": results,
     }
     _draw(folder, world_model, episodes, result)

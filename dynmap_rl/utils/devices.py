@@ -62,6 +62,14 @@ def choose_device(name: str) -> torch.device:
     return torch.device("cuda" if gpu and name != "cpu" else "cpu")
 
 
+def device_name(name: str) -> str:
+    """Return the device of :func:`choose_device` for a result: ``cpu``, or the product name of the GPU."""
+    import torch
+
+    device = choose_device(name)
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
+
+
 def seed_everything(seed: int) -> None:
     """Seed the generators of Python, NumPy and torch."""
     import torch

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from dynmap_rl.utils.devices import Compute, RankedCompute, choose_device, seed_everything
+from dynmap_rl.utils.devices import Compute, RankedCompute, choose_device, device_name, seed_everything
 
 
 def test_seeding_covers_every_generator():
@@ -23,6 +23,13 @@ def test_auto_is_the_gpu_where_there_is_one(monkeypatch, gpu):
     if not gpu:
         with pytest.raises(ValueError, match="cuda"):
             choose_device("cuda")
+
+
+def test_results_name_the_gpu_that_they_were_computed_on(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: f"NVIDIA {device.type}")
+    assert device_name("auto") == "NVIDIA cuda"
+    assert device_name("cpu") == "cpu"
 
 
 @pytest.mark.parametrize("settings", [{"device": "tpu"}, {"threads": 0}])
