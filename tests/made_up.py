@@ -32,9 +32,10 @@ def write(
         training: training of the cell.
         policy: kind of the policies.
         task: task of the policies.
-        rows: other outcomes of the episodes; or ``commit``; or ``first``, the number of the first world model.
+        rows: other outcomes of the episodes; or ``commit`` or ``device``; or ``first``, the number of the first world model.
     """
-    commit, first = rows.pop("commit", "abc"), rows.pop("first", 0)
+    origin = {"commit": rows.pop("commit", "abc"), "device": rows.pop("device", "cpu")}
+    first = rows.pop("first", 0)
     made = [make_rows(number, **rows) for number in successes]
     runs = runs_of((task, training, policy, row))
     names = [f"{training} {row} {first + number}" for number in range(len(made))]
@@ -47,7 +48,7 @@ def write(
         results = [[{"test": {"rows": one}, "paper": {"rows": one}}] * 3 for one in made]
     folder.mkdir(parents=True, exist_ok=True)
     for number, (run, seeds) in enumerate(zip(runs, results, strict=False)):
-        facts = {"task": task, "policy": policy, "row": row, "command": "python x.py", "commit": commit}
+        facts = {"task": task, "policy": policy, "row": row, "command": "python x.py", **origin}
         facts |= {"world_model_sha256": None if len(runs) == 1 else names[number], "results": seeds}
         (folder / f"{run.name}.json").write_text(json.dumps(facts))
 

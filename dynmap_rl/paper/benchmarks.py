@@ -13,7 +13,8 @@ from dynmap_rl.evaluation.statistics import shared_interval, summarize
 from dynmap_rl.utils.files import read_json
 
 from .cells import Run
-from .tables import cause_table, commits_text, join_table
+from .results import count_devices
+from .tables import cause_table, commits_text, devices_text, join_table
 
 TASKS = "FetchPush", "FetchSlide", "PlateSlide", "Soccer"
 SEEDS = 0, 1, 2  # of weights and batches, of world models and policies
@@ -52,7 +53,7 @@ Diffusion Policy are the recipes' defaults. Derived dynamics (of the hand, track
 
 {table}
 
-Runs by commit: {commits}. A run that was resumed names the commit at its end.
+Runs by commit: {commits}. A run that was resumed names the commit at its end.{devices}
 
 ## What fails
 
@@ -147,8 +148,8 @@ def benchmark_rows(results: Path) -> list[dict]:
     Returns:
         Dicts with ``task``, ``method``, ``seeds``, ``episodes``, ``SR``, ``SR_interval``, ``DR``, ``DR_interval`` (%),
         ``PE`` (mm), ``localization`` (mm; None if the world model does not predict the object's position), ``rates`` (SR of
-        each seed), ``causes`` (number of failed episodes by cause), ``commands`` and ``commits``. Intervals count with
-        start states that the seeds share.
+        each seed), ``causes`` (number of failed episodes by cause), ``commands``, ``commits`` and
+        ``devices``. Intervals count with start states that the seeds share.
 
     Raises:
         ValueError: the seeds of a row were evaluated on different scenes.
@@ -172,6 +173,7 @@ def benchmark_rows(results: Path) -> list[dict]:
                 "causes": summary.get("causes", {}),
                 "commands": [cell["command"] for cell in cells],
                 "commits": [str(cell.get("commit")) for cell in cells],
+                "devices": count_devices(cells),
             }
         )
     return table
@@ -222,6 +224,7 @@ def benchmark_page(rows: list[dict], folder: Path) -> str:
     return PAGE.format(
         table=benchmark_table(rows, experts),
         commits=commits_text(Counter(commit for row in rows for commit in row["commits"])),
+        devices=devices_text(sum((Counter(row["devices"]) for row in rows), Counter())),
         failures=cause_table(
             (t, row["episodes"], row["causes"]) for t, row in zip(titles, rows, strict=True)
         ),

@@ -134,3 +134,8 @@ def _read_cell(results: Path, key: Key, runs: list[Run]) -> Cell:
 def count_commits(cells: Iterable[Cell]) -> Counter[str]:
     """Return how many runs of some cells each commit has made."""
     return Counter(str(result.get("commit")) for cell in cells for result in cell.results)
+
+
+def count_devices(results: Iterable[dict]) -> Counter[str]:
+    """Return how many results were computed on each GPU; those that name no device are of a CPU."""
+    return Counter(result.get("device", "cpu") for result in results)

@@ -10,7 +10,7 @@ from dynmap_rl.evaluation.statistics import outcome_gap, summarize
 
 from .cells import TASKS, Key
 from .published import METRICS, TABLES
-from .results import COLUMNS, ROWS, Cell, count_commits
+from .results import COLUMNS, ROWS, Cell, count_commits, count_devices
 
 OWN = {  # tables that the paper does not have: what they show
     "extra": "World models with plain CNNs beside the default, on the shared test scenes",
@@ -215,6 +215,12 @@ def commits_text(commits: Counter[str]) -> str:
     return ", ".join(f"{count} of `{commit}`" for commit, count in commits.most_common())
 
 
+def devices_text(devices: Counter[str]) -> str:
+    """Return how many results are of each GPU, as a sentence; empty if all are of a CPU."""
+    gpus = [f"{count} on one {device}" for device, count in devices.most_common() if device != "cpu"]
+    return f" Of {devices.total()} runs, {' and '.join(gpus)}, the others without a GPU." if gpus else ""
+
+
 def _notes(cells: Iterable[Cell]) -> str:
     """Return what is missing of some cells, and how many runs are of which commit where there are several."""
     cells = list(cells)
@@ -230,4 +236,4 @@ def _notes(cells: Iterable[Cell]) -> str:
     commits = count_commits(cells)
     if len(commits) > 1:
         text += f" Runs of different code: {commits_text(commits)}."
-    return text
+    return text + devices_text(count_devices(result for cell in cells for result in cell.results))

@@ -56,6 +56,13 @@ def test_a_table_of_different_code_says_so(tmp_path):
     assert "def" not in markdown_column(read_cells(tmp_path), (TASK, "joint", "recurrent"))
 
 
+def test_a_table_names_the_gpus_of_its_runs(tmp_path):
+    write(tmp_path, "RGB+[P]", 20)
+    assert "GPU" not in markdown_column(read_cells(tmp_path), RECURRENT)
+    write(tmp_path, "RGB+[V]", 20, 30, device="NVIDIA X")
+    assert "Of 3 runs, 2 on one NVIDIA X" in markdown_column(read_cells(tmp_path), RECURRENT)
+
+
 def test_rows_of_the_tables_are_the_cells_with_a_run(tmp_path):
     write(tmp_path, "RGB+[P]", 20, 24)
     write(tmp_path, "Only-RGB", 10, 20, 30, training="joint")
