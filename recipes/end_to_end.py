@@ -35,6 +35,8 @@ class Config:
     run: Path | None = None
     # Seeds of world models and policies.
     seeds: str = "0,1,2"
+    # World model, of which encoder and transition are trained; without dynamics.
+    world_model: WorldModelArchitecture = WorldModelArchitecture("none")
     # Policy.
     policy: PolicyArchitecture = PolicyArchitecture()
     # Training of both.
@@ -45,6 +47,10 @@ class Config:
     compute: RankedCompute = RankedCompute()
     # Logger beside metrics.jsonl: tensorboard, wandb or trackio.
     logger: str | None = None
+
+    def __post_init__(self):
+        if self.world_model.supervision != "none":
+            raise ValueError("--world_model.supervision must be none for end-to-end training; see joint.py")
 
 
 def main(config: Config) -> None:
@@ -84,7 +90,7 @@ def main(config: Config) -> None:
     config = replace(config, training=training)
     world_model = train_seeds(
         partial(load_demonstrations, dataset, config.cache), folder,
-        WorldModelArchitecture("none"), config.policy, training,
+        config.world_model, config.policy, training,
         judge=partial(judge_in_closed_loop, task=config.task, settings=config.eval),
         seeds=seeds, compute=config.compute, logger=config.logger,
     )  # fmt: skip

@@ -109,7 +109,7 @@ def list_data_runs(
         datasets: folder of the datasets.
         only: rows to list.
         seeds: seeds of the world models; the run of end-to-end training has its own.
-        architecture: form of the world models; end-to-end training has none but the default.
+        architecture: form of the world models.
     """
     runs = []
     for size in SIZES:
@@ -117,9 +117,10 @@ def list_data_runs(
         runs += [
             _train(TASKS[0], name, seed, datasets, size, architecture) for seed in seeds for name in names
         ]
-        if "end_to_end" in only and architecture == "glimpse":
+        if "end_to_end" in only:
             dataset = str(dataset_folder(TASKS[0], "simulator", datasets, size))
             arguments = ("--task", TASKS[0], "--dataset", dataset, "--eval.paper_episodes", "0")
+            arguments += _form(architecture)
             name = name_run(TASKS[0], "end_to_end", 0, "recurrent", size)
             cell = TASKS[0], "joint", "recurrent", DATA_ROWS["end_to_end"]
             runs.append(Run(name, "end_to_end", cell, arguments, table="sources"))
@@ -194,6 +195,10 @@ def copy_quality(runs: list[Run], results: Path) -> None:
             write_json(results / "quality" / f"{folder.name}.json", read_json(judged))
 
 
+def _form(architecture: str) -> tuple[str, ...]:
+    return () if architecture == "glimpse" else ("--world_model.architecture", architecture)
+
+
 def _train(
     task: str, name: str, seed: int, datasets: Path, size: int = 300, architecture: str = "glimpse"
 ) -> Run:
@@ -204,7 +209,7 @@ def _train(
         "--world_model.supervision", source.supervision, "--eval.paper_episodes", "0",
         "--world_model.seed", str(seed), *source.options,
     )  # fmt: skip
-    arguments += () if architecture == "glimpse" else ("--world_model.architecture", architecture)
+    arguments += _form(architecture)
     cell = task, "decoupled", "recurrent", source.text
     return Run(name_run(task, name, seed, "recurrent", size), "decoupled", cell, arguments, table="sources")
 

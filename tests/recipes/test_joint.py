@@ -52,6 +52,12 @@ def test_its_world_model_on_task_3(place, recipe):
     assert shas[0] == shas[1]
 
 
+def test_end_to_end_training_has_no_dynamics(tmp_path):
+    result = run(tmp_path, "end_to_end", "--world_model.supervision", "velocity")
+    assert result.returncode == 2 and "supervision must be none" in result.stderr
+    assert not any(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("recipe", ["joint", "end_to_end"])
 @pytest.mark.parametrize(
     ("arguments", "message"),

@@ -101,6 +101,11 @@ def test_cells_of_the_plain_architecture_differ_in_the_training_of_their_world_m
     ]
     assert extra[0] == {("--world_model.architecture", "plain")}
     assert {name for name, _ in extra[1]} == {"--pretrained"}
+    calls.clear()
+    assert run(tmp_path, "--part", "data", "--only", "end_to_end", "--architecture", "plain").returncode == 0
+    assert len(calls) == len(SIZES) and {given["--world_model.architecture"] for _, given in calls} == {
+        "plain"
+    }
 
 
 def test_runs_of_the_tables_are_not_repeated(calls, tmp_path):
