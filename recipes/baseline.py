@@ -120,7 +120,8 @@ def train(config: Config, dataset: str | Path, folder: Path, seed: int, device: 
             "--policy.pretrained_backbone_weights=null", *([] if config.full_size else OPTIONS[config.policy]),
             "--dataset.repo_id=local/demonstrations", f"--dataset.root={root}",
             f"--dataset.episodes={list(read_split(root, read_info(root), 'train'))}",
-            "--dataset.use_imagenet_stats=false", f"--batch_size={config.batch}", "--num_workers=0",
+            "--dataset.use_imagenet_stats=false", f"--batch_size={config.batch}",
+            *(["--num_workers=0"] if device == "cpu" else []),  # a GPU would wait for the frames
             f"--steps={config.steps}", f"--save_freq={min(config.steps, 500)}", "--env_eval_freq=0",
             f"--seed={seed}", f"--output_dir={output}",
         ]  # fmt: skip
