@@ -5,6 +5,7 @@ Fig. 6 and 9 show a world model: see :func:`dynmap_rl.reporting.plot_prediction`
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from itertools import combinations
 from pathlib import Path
 
@@ -18,7 +19,6 @@ from dynmap_rl.keys import DYNAMICS
 from dynmap_rl.modules.normalization import Normalizer
 from dynmap_rl.modules.supervision import row_name
 from dynmap_rl.reporting.figures import COMPONENTS, UNITS, moving_steps, plt, save_figure
-from dynmap_rl.runs.folder import read_metrics
 
 FRAMES = 8  # in a film strip
 
@@ -117,22 +117,22 @@ def plot_scenes(frames: torch.Tensor, path: Path, columns: int = 8, rows: int = 
     save_figure(figure, path)
 
 
-def read_losses(folders: list[Path], held_out: bool = True) -> tuple[np.ndarray, np.ndarray]:
-    """Read the policy losses of every seed of some runs, at the optimiser steps that all of them have logged.
+def read_losses(results: Iterable[dict], kind: str = "held_out") -> tuple[np.ndarray, np.ndarray]:
+    """Read the policy losses of every seed of some results, at the optimiser steps that all of them have logged.
 
     Args:
-        folders: run folders with ``seed_N/metrics.jsonl``.
-        held_out: read the plain L1 loss on held-out demonstrations; otherwise the training loss (with its emphasis, on
-            one batch).
+        results: contents of ``eval.json``; those of a release without ``losses`` have no curves.
+        kind: ``held_out``, the plain L1 loss on held-out demonstrations, or ``training``, the training loss (with its
+            emphasis, on one batch).
 
     Returns:
         The steps ``[S]`` and the losses ``[R, S]`` of all R seeds (normalised units).
     """
-    names = ("held_out_loss",) if held_out else ("loss", "loss_policy")  # decoupled, joint
     curves = [
-        {row["step"]: row[name] for row in read_metrics(seed) for name in names if name in row}
-        for folder in folders
-        for seed in sorted(folder.glob("seed_*"))
+        dict(zip(seed["losses"]["step"], seed["losses"][kind], strict=True))
+        for result in results
+        for seed in result["results"]
+        if "losses" in seed
     ]
     steps = sorted(set.intersection(*map(set, curves))) if curves else []
     return np.array(steps), np.array([[curve[step] for step in steps] for curve in curves])
@@ -166,7 +166,7 @@ def loss_panels(task: str) -> dict[str, dict[str, list[str]]]:
 
 
 def plot_losses(
-    panels: dict[str, dict[str, list[str]]], runs: Path, missing: list[str], path: Path, held_out: bool = True
+    panels: dict[str, dict[str, list[str]]], results: Mapping[str, dict], path: Path, kind: str = "held_out"
 ) -> None:
     """Draw policy losses during training (paper, Fig. 7).
 
@@ -175,20 +175,24 @@ def plot_losses(
 
     Args:
         panels: see :func:`loss_panels`.
-        runs: folder with the runs of these names.
-        missing: names of runs that are not complete.
+        results: contents of ``eval.json`` by the names of the runs.
         path: file to write.
-        held_out: see :func:`read_losses`.
+        kind: see :func:`read_losses`.
     """
     figure, axes = plt.subplots(3, 2, figsize=(11, 12), layout="constrained", sharey=True)
-    kind = "on held-out demonstrations (plain L1)" if held_out else "in training (one batch, with emphasis)"
-    figure.suptitle(f"Balance-Reaching, policy loss {kind}: mean and std over runs and seeds", fontsize=11)
+    where = {
+        "held_out": "on held-out demonstrations (plain L1)",
+        "training": "in training (one batch, with emphasis)",
+    }
+    figure.suptitle(
+        f"Balance-Reaching, policy loss {where[kind]}: mean and std over runs and seeds", fontsize=11
+    )
     axes[0, 0].set_yscale("log")
     for axis, (title, groups) in zip(axes.flat, panels.items(), strict=True):
         axis.set_title(title, fontsize=10)
         for number, (label, names) in enumerate(groups.items()):
-            done = [runs / name for name in names if name not in missing]
-            steps, losses = read_losses(done, held_out)
+            done = [results[name] for name in names if name in results]
+            steps, losses = read_losses(done, kind)
             if not len(steps):
                 axis.plot([], [], f"C{number}", label=f"{label}: not run")
                 continue

@@ -16,6 +16,7 @@ from dynmap_rl.modules.actor import Actor
 from dynmap_rl.modules.checkpoints import load_policy
 from dynmap_rl.modules.supervision import row_name
 from dynmap_rl.modules.world_model import WorldModel
+from dynmap_rl.runs.folder import read_metrics
 from dynmap_rl.utils.devices import device_name
 from dynmap_rl.utils.files import read_json, write_json
 from dynmap_rl.utils.version import find_commit
@@ -83,7 +84,10 @@ def write_report(
         "command": command,
         "commit": find_commit(),
         "device": device_name(settings.get("compute", {}).get("device", "auto")),
-        "results": results,
+        "results": [
+            one | {"losses": _policy_losses(folder / f"seed_{seed}")}
+            for one, seed in zip(results, seeds, strict=True)
+        ],
     }
     _draw(folder, world_model, episodes, result)
     published = compare(result) if compare else None
@@ -114,6 +118,16 @@ def _describe(dataset: str | Path) -> dict:
     meta = find_meta(find_dataset(dataset))
     facts = {"kind": meta["kind"], "episodes": meta["splits"]["train"][1]} if meta else {}
     return {"dataset": str(dataset)} | facts
+
+
+def _policy_losses(folder: Path) -> dict[str, list[float]]:
+    """Return the policy's losses by optimiser step: plain L1 held out, and that of a training batch, with emphasis."""
+    rows = [row for row in read_metrics(folder) if "held_out_loss" in row]
+    training = [
+        row["loss_policy"] if "loss_policy" in row else row["loss"] for row in rows
+    ]  # joint, decoupled
+    held_out = [row["held_out_loss"] for row in rows]
+    return {"step": [row["step"] for row in rows], "held_out": held_out, "training": training}
 
 
 def _paper_protocol(results: list[dict]) -> dict:

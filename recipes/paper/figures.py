@@ -36,6 +36,8 @@ class Config:
 
     # Folder with the runs of recipes/paper/tables.py.
     runs: Path = Path("runs/tables")
+    # Folder of the results of recipes/paper/tables.py, for fig7; by default those of the repository.
+    results: Path = Path(__file__).parents[1] / "results/cells"
     # Folder of the figures.
     output: Path = Path("runs/figures")
     # Names of figures, such as fig2,fig7; by default all.
@@ -144,12 +146,19 @@ def draw_prediction(config: Config, datasets: dict, task: str, name: str) -> Non
 def draw_fig7(config: Config, datasets: dict) -> None:
     """Draw the policies' losses, on held-out demonstrations and in training."""
     from dynmap_rl.paper.figures import loss_panels, plot_losses
+    from dynmap_rl.utils.files import read_json
 
     panels = loss_panels(ONE)
-    cells = dict.fromkeys(cell for groups in panels.values() for group in groups.values() for cell in group)
-    missing = find_missing(config.runs, list(cells))
-    plot_losses(panels, config.runs, missing, config.output / "fig7.png")
-    plot_losses(panels, config.runs, missing, config.output / "fig7_training.png", held_out=False)
+    names = {cell for groups in panels.values() for group in groups.values() for cell in group}
+    found = {name: read_json(path) for name in names if (path := config.results / f"{name}.json").exists()}
+    found = {name: result for name, result in found.items() if "losses" in result["results"][0]}
+    if not found:
+        raise ValueError(
+            f"{config.results} must have results with losses; run python recipes/paper/tables.py --results runs/results"
+        )
+    print(f"{len(found)} of {len(names)} results are there")
+    plot_losses(panels, found, config.output / "fig7.png")
+    plot_losses(panels, found, config.output / "fig7_training.png", "training")
     print(f"written: {config.output}/fig7_training.png")
 
 

@@ -18,7 +18,6 @@ from dynmap_rl.paper.figures import (
     widest_ways,
 )
 from dynmap_rl.reporting.figures import moving_steps
-from dynmap_rl.runs.folder import append_metrics
 
 RED, BLUE = to_hex("tab:red"), to_hex("tab:blue")
 
@@ -32,10 +31,17 @@ def figures(monkeypatch):
     plt.close("all")
 
 
-def write_run(folder, seeds: dict[int, list[float]], name="loss", every=100):
-    for seed, losses in seeds.items():
-        for i, loss in enumerate(losses, start=1):
-            append_metrics(folder / f"seed_{seed}", every * i, held_out_loss=loss, **{name: 2 * loss})
+def make_result(*seeds: list[float], every=100) -> dict:
+    """A result with the held-out losses of some seeds; those in training are twice as large."""
+    losses = [
+        {
+            "step": [every * i for i in range(1, len(values) + 1)],
+            "held_out": values,
+            "training": [2 * v for v in values],
+        }
+        for values in seeds
+    ]
+    return {"results": [{"losses": one} for one in losses]}
 
 
 def closed_loop(drops: list[int | None], steps=12) -> TensorDict:
@@ -49,31 +55,28 @@ def closed_loop(drops: list[int | None], steps=12) -> TensorDict:
     return TensorDict(entries, [len(drops), steps])
 
 
-def test_losses_are_the_numbers_of_the_runs(tmp_path):
-    write_run(tmp_path / "one", {0: [0.5, 0.25], 1: [0.4, 0.2]})
-    write_run(tmp_path / "two", {0: [0.3, 0.1]}, name="loss_policy")  # as joint training calls it
-    folders = [tmp_path / "one", tmp_path / "two"]
-    steps, losses = read_losses(folders)
+def test_losses_are_those_of_every_seed():
+    results = [make_result([0.5, 0.25], [0.4, 0.2]), make_result([0.3, 0.1])]
+    steps, losses = read_losses(results)
     assert steps.tolist() == [100, 200]
     assert losses.tolist() == [[0.5, 0.25], [0.4, 0.2], [0.3, 0.1]]
-    assert read_losses(folders, held_out=False)[1].tolist() == [[1.0, 0.5], [0.8, 0.4], [0.6, 0.2]]
+    assert read_losses(results, "training")[1].tolist() == [[1.0, 0.5], [0.8, 0.4], [0.6, 0.2]]
 
 
-def test_only_steps_that_all_seeds_have_are_compared(tmp_path):
-    write_run(tmp_path / "one", {0: [0.5, 0.4, 0.3], 1: [0.2, 0.1]})
-    steps, losses = read_losses([tmp_path / "one"])
+def test_only_steps_that_all_seeds_have_are_compared():
+    steps, losses = read_losses([make_result([0.5, 0.4, 0.3], [0.2, 0.1])])
     assert steps.tolist() == [100, 200] and losses.tolist() == [[0.5, 0.4], [0.2, 0.1]]
-    assert [len(values) for values in read_losses([])] == [0, 0]
+    assert [len(values) for values in read_losses([{"results": [{}]}])] == [0, 0]
 
 
 def test_curves_are_means_over_the_seeds_of_a_group(tmp_path, figures):
     panels = loss_panels("balance_reaching")
     with_velocity = panels["(e) velocity prediction"]["with velocity"]
-    write_run(tmp_path / with_velocity[0], {0: [0.5, 0.25], 1: [0.3, 0.15]})
-    write_run(tmp_path / with_velocity[1], {0: [0.1, 0.05]})
-    missing = [name for panel in panels.values() for names in panel.values() for name in names]
-    missing = [name for name in missing if name not in with_velocity[:2]]
-    plot_losses(panels, tmp_path, missing, tmp_path / "fig7.png")
+    results = {
+        with_velocity[0]: make_result([0.5, 0.25], [0.3, 0.15]),
+        with_velocity[1]: make_result([0.1, 0.05]),
+    }
+    plot_losses(panels, results, tmp_path / "fig7.png")
     axes = {axis.get_title(): axis for axis in figures[0].axes}
     assert list(axes) == list(panels)
     there, absent = axes["(e) velocity prediction"].lines
@@ -94,10 +97,8 @@ def test_panels_compare_one_thing_each():
 
 def test_a_panel_of_nothing_says_that_it_was_not_run(tmp_path, figures):
     panels = loss_panels("balance_reaching")
-    write_run(tmp_path / "balance_reaching_joint_none_recurrent", {0: [0.5]}, "loss_policy")
-    names = {name for panel in panels.values() for group in panel.values() for name in group}
-    missing = list(names - {"balance_reaching_joint_none_recurrent"})
-    plot_losses(panels, tmp_path, missing, tmp_path / "fig7.png")
+    results = {"balance_reaching_joint_none_recurrent": make_result([0.5])}
+    plot_losses(panels, results, tmp_path / "fig7.png")
     plot_position_errors({"one": closed_loop([None]), "two": None}, tmp_path / "fig8.png")
     said = [[text.get_text() for text in axis.texts] for figure in figures for axis in figure.axes]
     assert said == [["not run"], [], *([["not run"]] * 4), [], ["not run"]]

@@ -11,7 +11,6 @@ from dynmap_rl.envs.scene import scene_seeds
 from dynmap_rl.modules.checkpoints import make_policy, make_world_model, save_policy, save_world_model
 from dynmap_rl.paper.cells import list_runs
 from dynmap_rl.paper.figures import loss_panels
-from dynmap_rl.runs.folder import append_metrics
 from dynmap_rl.utils.files import read_json, write_json
 from recipes.paper.figures import POLICIES, WORLD_MODEL, Config, main
 
@@ -28,12 +27,14 @@ def make_run(folder, constants, supervision, policy):
     model = make_world_model(constants, supervision, latent_size=8, hidden_size=8)
     save_world_model(folder / "world_model", model)
     save_policy(folder / "seed_0" / "policy", make_policy(constants, policy, model, width=8), model)
-    append_metrics(folder / "seed_0", 100, loss=0.2, held_out_loss=0.1)
     rows = make_rows(2, count=3) | {"dropped": "000", "touched": "000"}
     rows |= {"first_scene_seed": scene_seeds("test", 1)[0]}
     source = {"task": "balance_reaching", "training": "decoupled"}
     facts = {"task": "balance_reaching", "row": "RGB+[P]", "policy": policy, "world_model": source}
-    write_json(folder / "eval.json", facts | {"seeds": [0], "results": [{"test": {"rows": rows}}]})
+    losses = {"step": [100], "held_out": [0.1], "training": [0.2]}
+    result = facts | {"seeds": [0], "results": [{"test": {"rows": rows}, "losses": losses}]}
+    write_json(folder / "eval.json", result)
+    write_json(folder.parent / f"{folder.name}.json", result)
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +59,7 @@ def few_episodes(monkeypatch):
 @pytest.mark.slow
 def test_draws_every_figure(runs, recordings, few_episodes, tmp_path, capsys):
     datasets = ",".join(str(recordings(task)) for task in ("balance_reaching", "bin_dropping"))
-    main(Config(runs=runs, output=tmp_path, datasets=datasets))
+    main(Config(runs=runs, results=runs, output=tmp_path, datasets=datasets))
     names = {
         "distributions",
         "failures",
@@ -92,7 +93,8 @@ def test_a_missing_dataset_is_named(tmp_path):
 
 
 def test_a_missing_run_is_named_after_the_other_figures(recording, tmp_path):
-    result = run(tmp_path, "figures", "--only", "fig6,fig7,fig8,fig4", "--datasets", recording)
+    given = "--only", "fig6,fig7,fig8,fig4", "--datasets", recording, "--results", "results"
+    result = run(tmp_path, "figures", *given)
     assert result.returncode == 2
     assert result.stdout == "written: runs/figures/fig4.png\n"
     assert len(result.stderr.splitlines()) == 1
@@ -125,10 +127,10 @@ def test_what_is_there_is_drawn(runs, few_episodes, tmp_path, capsys):
     cell = POLICIES["(b) RGB+[P+V], recurrent policy"]
     part.mkdir()
     (part / cell).symlink_to(runs / cell)
-    main(Config(runs=part, output=tmp_path, only="fig7,fig8"))
+    main(Config(runs=part, results=runs, output=tmp_path, only="fig7,fig8"))
     assert is_drawn(tmp_path / "fig7.png") and is_drawn(tmp_path / "fig8.png")
     text = capsys.readouterr().out
-    assert "1 of 25 runs are there" in text and "1 of 2 runs are there" in text
+    assert "3 of 25 results are there" in text and "1 of 2 runs are there" in text
 
 
 def test_an_unknown_figure_gets_one_clear_line(tmp_path):

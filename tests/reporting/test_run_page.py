@@ -10,6 +10,7 @@ from dynmap_rl.evaluation.settings import Evaluation
 from dynmap_rl.evaluation.statistics import shared_interval, summarize
 from dynmap_rl.modules.checkpoints import make_policy, save_policy
 from dynmap_rl.reporting.run_page import row_text, write_report
+from dynmap_rl.runs.folder import append_metrics
 from dynmap_rl.utils.files import read_json, write_json
 
 PUBLISHED = {"SR": (89.0, 0.9)}
@@ -27,6 +28,8 @@ def run(tmp_path_factory):
             model, policy, "balance_reaching", Evaluation("validation", 2, paper_episodes)
         )
         write_json(folder / f"seed_{seed}/eval.json", result | {"world_model_sha256": "one"})
+        append_metrics(folder / f"seed_{seed}", 50, loss_rgb=0.5)
+        append_metrics(folder / f"seed_{seed}", 100, loss=0.2, held_out_loss=0.1)
     return folder, model
 
 
@@ -46,6 +49,7 @@ def test_the_result_collects_the_seeds(run, recording):
     assert compared == [result]
     assert read_json(run[0] / "eval.json")["test_protocol"]["SR"] == result["test_protocol"]["SR"]
     assert result["row"] == "RGB+[P]" and result["trained_on"]["episodes"] == 4
+    assert result["results"][1]["losses"] == {"step": [100], "held_out": [0.1], "training": [0.2]}
     both = [seed["test"]["summary"] for seed in result["results"]]
     for name in ("SR", "DR", "PE", "localization"):
         assert result["test_protocol"][name] == pytest.approx(np.mean([s[name] for s in both]), abs=1e-1), (
