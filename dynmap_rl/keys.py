@@ -23,4 +23,5 @@ OPTIONAL = {  # columns that a dataset may lack, likewise
     ("next", "is_success"): "next.success",
     "disturbed": "disturbed",
     "expert_action": "expert_action",
+    "labelled": "dynamics.found",
 }

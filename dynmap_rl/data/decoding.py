@@ -19,6 +19,7 @@ from .format.reading import iterate_tables, read_column, read_table
 
 BLOCK = 500  # frames that a thread decodes at a time
 FLAGS = "done", "terminated", "truncated"
+BOOL = "disturbed", "labelled"
 Key = str | tuple[str, str]
 Allocate = Callable[[Key, tuple[int, ...], torch.dtype], torch.Tensor]
 
@@ -65,7 +66,7 @@ def decode_episodes(
         for key, name in columns.items():
             part = read_column(root, info, table, name)
             if key not in values:
-                values[key] = new(key, part.shape[1:], torch.bool if key == "disturbed" else part.dtype)
+                values[key] = new(key, part.shape[1:], torch.bool if key in BOOL else part.dtype)
             values[key][torch.from_numpy(place)] = part.to(values[key].dtype)
         if pixels:
             _decode_frames(root, table, layout, frames, place)
@@ -129,6 +130,7 @@ def choose_columns(root: Path, info: dict, layout: Layout) -> dict:
     sizes = dict.fromkeys(OPTIONAL.values(), 1) | {"expert_action": len(layout.action)}
     sizes |= {"observation.state": len(layout.state), "action": len(layout.action)}
     sizes |= {f"dynamics.{quantity}": len(names) for quantity, names in layout.dynamics.items()}
+    sizes["dynamics.found"] = len(layout.position)
     for name, size in sizes.items():
         if name in features and (shape := tuple(features[name]["shape"])) != (size,):
             raise ValueError(

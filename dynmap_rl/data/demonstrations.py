@@ -69,6 +69,8 @@ def load_dataset(dataset: str | Path, split: str | None = None, cache: Path | No
         - ``("dynamics", "position" | "velocity" | "acceleration")`` ``[E, T, 6]``
         - ``expert_action`` ``[E, T, 3]``, where the dataset has it: what the expert would have done, without noise and
           pushes; imitation learns it
+        - ``labelled`` bool ``[E, T, 6]``, where the dataset has the column ``dynamics.found``: what was seen in the frame;
+          other positions are interpolated, and the loss of the dynamics leaves them out
         - ``disturbed`` ``[E, T, 1]``: a push acted in the place of the expert; false without such a column
         - ``("next", "reward" | "is_success")`` ``[E, T, 1]``, where the dataset has the columns ``next.reward`` and
           ``next.success``

@@ -96,7 +96,8 @@ def add_dynamics(
 ) -> dict:
     """Copy a LeRobot v3.0 dataset and add the columns ``dynamics.position``, ``.velocity`` and ``.acceleration``.
 
-    The columns (float32) are computed for one episode at a time, in float64, with the times of the column ``timestamp``.
+    From frames there is also ``dynamics.found`` (bool): whether what an entry belongs to was found in the frame. Other
+    positions are interpolated, and trainings leave these entries out. The columns (float32) are computed for one episode at a time, in float64, with the times of the column ``timestamp``.
     The new folder appears when it is complete. Videos are hard-linked where the file system can; all other files are
     copied. A recording of a task stays one, and can be trained on with the recipes of the tasks: its constants of
     normalisation and the names of its dynamics are written anew. ``meta/dynamics.json`` has all settings, and
@@ -168,6 +169,7 @@ def add_dynamics(
     rows = dict(spans(table["episode_index"].to_numpy()))
     _check_lengths(root, rows, [part[2] for part in parts], window)
     values, derived, start = {q: np.empty((len(table), len(names))) for q in DYNAMICS}, [], 0
+    seen = np.ones((len(table), len(names)), dtype=bool)
     for own_names, motions, own_method in parts:
         own = slice(start, start := start + len(own_names))
         for episode, motion in motions:
@@ -177,11 +179,15 @@ def add_dynamics(
                 raise ValueError(f"{root}: episode {episode} {error}") from error
             for quantity, part in found.items():
                 values[quantity][rows[episode], own] = part
+            if motion.found is not None:
+                seen[rows[episode], own] = motion.found.repeat(len(own_names) // motion.found.shape[1], 1)
             derived.append(Derived(episode, own_names, found["position"], found["velocity"], motion))
             angles = motion.angles
         for entry in angles:
             align_turns(values["position"][:, own][:, entry], list(rows.values()), motion.period)
     new = {f"dynamics.{q}": v.astype(np.float32) for q, v in values.items()}
+    if view or "dynamics.found" in info["features"]:
+        new["dynamics.found"] = seen
     meta = _describe(meta, planar, names, values, rows) if meta else None
     there = {
         q: read_column(root, info, table, f"dynamics.{q}", np.float64).numpy()

@@ -105,7 +105,7 @@ def load_robot_dataset(
         every quantity of the dynamics). Pieces are ``[P, T]``: ``pixels`` uint8 ``[P, T, 3, S, cameras * S]``, ``action``
         ``[P, T, A]``, ``goal`` ``[P, T, G]`` (G = 0 without a goal), ``("dynamics", quantity)`` ``[P, T, D]`` for the
         columns that the dataset has, float32 in its units, ``disturbed`` bool ``[P, T, 1]`` where the dataset has such a
-        column of flags, and ``episode`` int64 ``[P, T]``, the episode's index.
+        column of flags, ``labelled`` bool ``[P, T, D]`` likewise (see :func:`dynmap_rl.data.load_dataset`), and ``episode`` int64 ``[P, T]``, the episode's index.
 
     Raises:
         ValueError: the dataset is missing or damaged, or fewer than two episodes are long enough.
@@ -138,6 +138,8 @@ def _read_numbers(layout: dict) -> tuple[dict, dict[int, slice]]:
     pushes = info["features"].get("disturbed", {})
     if (pushes.get("dtype"), pushes.get("shape")) == ("bool", [1]):
         columns["disturbed"] = "disturbed"
+    if "dynamics.found" in info["features"]:
+        columns["labelled"] = "dynamics.found"
     goal, entries = layout["goal"] or ("action", [])
     table = read_table(root, info, list({*columns.values(), goal}))
     numbers = {key: read_column(root, info, table, name) for key, name in (columns | {"goal": goal}).items()}

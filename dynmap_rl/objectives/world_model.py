@@ -27,8 +27,9 @@ class WorldModelLoss(LossModule):
     Input: ``pixels`` uint8 ``[B, T, 3, S, cameras * S]``, ``action`` ``[B, T, A]`` and, for every supervised quantity,
     ``("dynamics", quantity)`` ``[B, T, D]``, in SI units. Optional: a mask of valid steps, bool ``[B, T]`` or
     ``[B, T, 1]``, under ``loss_mask_key`` of :class:`torchrl.objectives.LossModule`, by default
-    ``("collector", "mask")``; invalid steps are left out. Also optional: ``labelled``, bool ``[B, T]`` or ``[B, T, 1]``,
-    the steps whose dynamics are known; the loss of the dynamics is the mean over these.
+    ``("collector", "mask")``; invalid steps are left out. Also optional: ``labelled``, bool ``[B, T]``,
+    ``[B, T, 1]`` or ``[B, T, D]``, the steps, or entries, whose dynamics are known. Unknown entries count as right, and the
+    loss of the dynamics is the mean over the steps with a known one.
 
     Output: ``loss_rgb`` (times ``beta_rgb``), ``loss_latent`` (times ``beta_z``) and, where supervised, ``loss_position``,
     ``loss_velocity``, ``loss_acceleration`` (times ``beta_dynamics``): scalars whose sum is to be minimised.
@@ -138,7 +139,7 @@ class WorldModelLoss(LossModule):
         pixels = tensordict[keys.pixels][:, 1:]
         masks = tensordict.select(*self._loss_mask_keys(), strict=False)[:, 1:]
         known = tensordict.get(keys.labelled, None)
-        known = known if known is None else known[:, 1:]
+        known = known if known is None else known[:, 1:].reshape(*pixels.shape[:2], -1)
         losses = {}
         if self.beta_rgb:
             rgb = self._rgb_loss(masks, pixels, predicted, hidden1, hidden2)
@@ -149,9 +150,9 @@ class WorldModelLoss(LossModule):
             truth = tensordict[unravel_key((keys.dynamics, name))][:, 1:]
             for mask in (known, *masks.values(True, True)):
                 if mask is not None:  # unknown entries may be NaN, whose gradient no mask stops
-                    truth = torch.where(mask.reshape(*truth.shape[:2], 1), truth, value.detach())
+                    truth = torch.where(mask.reshape(*truth.shape[:2], -1), truth, value.detach())
             losses[f"loss_{name}"] = self.beta_dynamics * self._mean(
-                rms((value - truth) / scale), masks, known
+                rms((value - truth) / scale), masks, known if known is None else known.any(-1)
             )
         return losses
 

@@ -73,7 +73,8 @@ def train_world_model(
     settings = settings or WorldModelTraining()
     train = episodes["train"]
     if settings.labelled < 1:
-        train = train.copy().set("labelled", choose_labelled(train, settings.labelled, settings.seed))
+        chosen, found = choose_labelled(train, settings.labelled, settings.seed), train.get("labelled", None)
+        train = train.copy().set("labelled", chosen if found is None else chosen & found)
     fit(
         world_model,
         lambda generator: make_loss(world_model, settings, generator),

@@ -109,6 +109,19 @@ def test_unknown_dynamics_may_be_nan(mask):
     assert losses[0] == losses[1]
 
 
+def test_entries_that_are_not_labelled_have_no_effect_and_others_have():
+    td, (_, loss) = batch(), make(("position",))
+    size = td["dynamics", "position"].shape[-1]
+    td["labelled"] = (torch.arange(size) < 3).expand(2, 5, size)  # the cart, as where the block is hidden
+    expected = loss(td)["loss_position"]
+    td["dynamics", "position"][..., 3:] = torch.nan
+    torch.testing.assert_close(loss(td)["loss_position"], expected)
+    loss(td)["loss_position"].backward()
+    assert all(p.grad.isfinite().all() for p in loss.parameters() if p.grad is not None)
+    td["dynamics", "position"][..., :3] += 1.0
+    assert loss(td)["loss_position"] > expected
+
+
 def test_a_call_with_tensors_is_that_with_a_tensordict():
     td, (_, loss) = batch(t=6), make(())
     torch.manual_seed(0)

@@ -12,10 +12,12 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import robot_dataset
 import torch
 from commands import run
 from robot_dataset import CAMERA, FPS, make_robot_dataset
 
+from dynmap_rl.data import add_dynamics, load_robot_dataset
 from dynmap_rl.data.demonstrations import find_meta, load_dataset, load_demonstrations, load_meta
 from recipes.add_dynamics import Config, main
 
@@ -269,6 +271,36 @@ def test_state_and_tracks_stand_side_by_side_and_are_judged_together(videos, tmp
     checks = json.loads((tmp_path / "runs/add_dynamics/both/quality.json").read_text())["checks"]
     assert {"lost", "residual", "agreement"} < set(checks) and "residual_angle" not in checks
     assert (tmp_path / "runs/add_dynamics/both/tracks.png").exists()
+
+
+def test_entries_of_an_object_that_is_hidden_are_not_labels(monkeypatch, tmp_path):
+    drawn, draw = [], robot_dataset.draw
+    table = np.full((96, 128, 3), 190, np.uint8)
+    monkeypatch.setattr(
+        robot_dataset, "draw", lambda p: drawn.append(p) or (table if 10 < len(drawn) < 15 else draw(p))
+    )
+    source = make_robot_dataset(tmp_path / "source", LENGTHS)
+    colored = {"colors": ["#c81e1e"], "point": True, "columns": [0, 1]}
+    add_dynamics(source, tmp_path / "both", source="state,tracks", **colored)
+    info = json.loads((tmp_path / "both/meta/info.json").read_text())["features"]["dynamics.found"]
+    assert info["dtype"] == "bool" and info["names"] == ["x", "y", "object1_x", "object1_y"]
+    hidden = np.zeros((sum(LENGTHS), 4), dtype=bool)
+    hidden[10:14, 2:] = True
+    assert np.array_equal(read(tmp_path / "both", "dynamics.found").astype(bool), ~hidden)
+    episodes, _ = load_robot_dataset(tmp_path / "both", min_steps=24, image_size=32)
+    pieces = torch.cat(list(episodes.values()))
+    assert pieces["labelled"].dtype == torch.bool and 0 < (~pieces["labelled"]).sum() <= 2 * 8
+    assert open_with_lerobot(tmp_path / "both")[12]["dynamics.found"].tolist() == [True, True, False, False]
+    add_dynamics(tmp_path / "both", tmp_path / "again", columns=[0, 1], replace=True)
+    assert read(tmp_path / "again", "dynamics.found").all(), "nothing is left of the tracks"
+
+
+def test_trainings_of_the_tasks_leave_out_what_was_not_found(recording, tmp_path):
+    add_dynamics(recording, tmp_path / "tracked", source="tracks", replace=True)
+    episodes = load_dataset(tmp_path / "tracked")
+    assert np.array_equal(
+        episodes["labelled"].flatten(0, 1).numpy(), read(tmp_path / "tracked", "dynamics.found")
+    )
 
 
 @pytest.mark.parametrize(

@@ -77,6 +77,20 @@ def test_dynamics_of_unlabelled_episodes_have_no_effect_and_others_have(tmp_path
     assert weights[0] == weights[1] != weights[2]
 
 
+def test_entries_that_were_not_found_have_no_effect(tmp_path):
+    weights = []
+    for value in (0.0, 5.0):
+        episodes, model = make_episodes(), make_model()
+        train = episodes["train"] = episodes["train"].clone()
+        found = torch.ones_like(train["dynamics", "position"], dtype=torch.bool)
+        found[..., 3:] = False
+        train["labelled"] = found
+        train["dynamics", "position"][..., 3:] = value
+        train_world_model(model, episodes, tmp_path / str(value), replace(WORLD_MODEL, labelled=0.6))
+        weights.append(fingerprint(model))
+    assert weights[0] == weights[1]
+
+
 def test_labelled_episodes_are_whole_seeded_and_nested():
     episodes = make_episodes(20)["train"]
     draws = [choose_labelled(episodes, share, 3) for share in (0.01, 0.25, 0.5, 1.0)]

@@ -36,7 +36,7 @@ def write_columns(
         output: the new folder.
         info: content of the dataset's ``meta/info.json``.
         table: ``index`` and ``episode_index`` of all frames, in order.
-        values: new columns, float32 ``[N, D]``, by name.
+        values: new columns, float32 or bool ``[N, D]``, by name.
         names: names of the D entries.
         replaced: content of JSON files by their paths relative to ``root``, in the place of the dataset's own; None
             leaves a file out.
@@ -64,7 +64,7 @@ def write_columns(
             else:
                 shutil.copy2(file, target)
         shape = [len(names)]
-        features = {name: {"dtype": "float32", "shape": shape, "names": names} for name in values}
+        features = {n: {"dtype": str(v.dtype), "shape": shape, "names": names} for n, v in values.items()}
         write_json(temporary / "meta" / "info.json", info | {"features": info["features"] | features})
         for name, numbers in values.items():
             stats[name] = {key: value.tolist() for key, value in compute_stats(numbers).items()}
