@@ -66,6 +66,7 @@ def main(config: Config) -> None:
     from dynmap_rl.training.dagger import check_corrections
     from dynmap_rl.training.dataset import check_dataset, choose_augmentation, find_or_record
     from dynmap_rl.training.decoupled import check_same, train_policies
+    from dynmap_rl.training.settings import check_windows
     from dynmap_rl.training.world_model import build_world_model, train_world_model
     from dynmap_rl.utils.devices import choose_device, seed_everything
     from dynmap_rl.utils.files import read_json
@@ -78,6 +79,8 @@ def main(config: Config) -> None:
     check_corrections(config.policy, config.task)
     if config.dataset:
         check_dataset(config.dataset, config.task)
+    if not config.pretrained:
+        check_windows(config.world_model, task.layout.steps, "world_model")
     world_model = load_pretrained(config) if config.pretrained else None
     origin = {"task": config.task, "training": "decoupled"}
     name = f"{config.world_model.supervision.replace(',', '_')}_{config.policy.kind}"

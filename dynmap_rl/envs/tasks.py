@@ -279,6 +279,8 @@ def _parse_arguments(text: str) -> dict[str, object]:
 
 
 def _parse_value(text: str) -> object:
+    if text in ("true", "false"):  # as recipes write them
+        return text == "true"
     try:
         return ast.literal_eval(text)
     except (ValueError, SyntaxError):

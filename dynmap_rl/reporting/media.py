@@ -10,7 +10,8 @@ import torch
 from PIL import Image
 from tensordict.nn import TensorDictModuleBase
 
-from dynmap_rl.data.recording.plans import SCRIPTED, Plan, demonstrate
+from dynmap_rl.data.recording.demonstrators import demonstrate
+from dynmap_rl.data.recording.plans import SCRIPTED, Plan
 from dynmap_rl.envs.delay import FrameDelay
 from dynmap_rl.envs.renderer import Renderer
 from dynmap_rl.envs.task import Task

@@ -12,7 +12,7 @@ from torch import nn
 from tqdm import tqdm
 
 from dynmap_rl.data.augmentation import augment
-from dynmap_rl.data.windows import sample_windows
+from dynmap_rl.data.windows import check_length, sample_windows
 from dynmap_rl.modules.precision import mixed_precision
 from dynmap_rl.runs.folder import load_training_state, save_training_state, truncate_metrics
 from dynmap_rl.runs.loggers import log_metrics
@@ -63,6 +63,7 @@ def fit(
             raise ValueError(
                 f"windows of a batch must be a multiple of {ranks()} processes, got {batch} of {length} steps"
             )
+        check_length(length, episodes.shape[1])
     folder = Path(folder)
     device = next(model.parameters()).device
     model.to(memory_format=torch.channels_last)  # with bfloat16 six times faster on a CPU

@@ -175,6 +175,14 @@ class JointTraining(EndToEndTraining):
         check_at_least(self, 0, "rarity", "beta_z", "beta_dynamics", "beta_joint")
 
 
+def check_windows(settings: WorldModelTraining | EndToEndTraining, steps: int, group: str) -> None:
+    """Raise ``ValueError`` where windows are longer than episodes of ``steps`` steps; ``group`` is that of the option."""
+    if settings.window_steps > steps:
+        raise ValueError(
+            f"--{group}.window_steps must be at most {steps}, the steps of an episode, got {settings.window_steps}"
+        )
+
+
 def windows_at(settings: WorldModelTraining | EndToEndTraining, update: int) -> tuple[int, int]:
     """Return number and steps of the windows of an update: at first many short ones, then the settings' own."""
     if update < settings.short_windows * settings.updates and settings.window_steps > SHORT:

@@ -155,7 +155,8 @@ def test_unfinished_shards_of_other_settings_are_refused(tmp_path, changes, mess
     settings = {"task": "balance_reaching", "expert": "balance_reaching", "kind": "demonstrations"}
     settings |= {"episodes": 4, "eval_episodes": 2, "format": FORMAT, **changes}
     write_json(tmp_path / "d.parts" / "settings.json", settings)
-    with pytest.raises(ValueError, match=rf"another recording \({message}\)"):
+    (tmp_path / "d.parts" / "train_0000").mkdir()
+    with pytest.raises(ValueError, match=rf"d.parts holds another recording \({message}\)"):
         record_dataset(tmp_path / "d", episodes=4, eval_episodes=2)
 
 

@@ -64,6 +64,7 @@ def test_end_to_end_training_has_no_dynamics(tmp_path):
     [
         (["--training.updates", "0"], "updates must be at least 1"),
         (["--policy.kind", "transformer"], "'transformer'"),
+        (["--training.window_steps", "200"], "--training.window_steps must be at most 120"),
     ],
 )
 def test_bad_input_is_refused_before_anything_is_written(tmp_path, recipe, arguments, message):

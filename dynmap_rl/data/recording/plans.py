@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import torch
 from tensordict import TensorDict
 
-from dynmap_rl.envs.protocol import BaseTask, SimulatedWorld
 from dynmap_rl.envs.scene import scene_seed
 from dynmap_rl.envs.task import Task
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.envs.world import EPISODE_STEPS, LARGEST_CHANGE, World, limit_actions
 from dynmap_rl.experts.network import list_checkpoints, load_expert
-from dynmap_rl.keys import DYNAMICS
+
+from .demonstrators import demonstrate
 
 SCRIPTED = "scripted"  # in the place of a checkpoint
 KEYS = [
@@ -162,74 +160,6 @@ def run_plans(task: str, plans: list[Plan], expert: str | Path | None = None) ->
         steps.append(td.select(*KEYS))
         td = td["next"]
     return torch.stack(steps, 1)
-
-
-def demonstrate(task: str, plans: list[Plan]) -> TensorDict:
-    """Run the demonstrator of a task by the plans, one episode after the other.
-
-    Noise is in units of the largest action.
-
-    Args:
-        task: name of the task.
-        plans: one plan for each episode.
-
-    Returns:
-        ``[E, T]``, as :func:`run_plans` returns them.
-    """
-    rules, episodes = get_task(task), []
-    draw, world = _open_simulator(task, type(rules))
-    for plan in plans:
-        world = rules.begin(plan.scene_seed, None, world)
-        rows = list(_demonstrate(rules, draw, world, plan))
-        steps = {key: torch.from_numpy(np.stack([row[key] for row in rows])) for key in rows[0]}
-        episodes.append(TensorDict(steps, [len(rows)]).unflatten_keys("."))
-    out = torch.stack(episodes)
-    out["pixels"] = out["pixels"].permute(0, 1, 4, 2, 3)
-    return out
-
-
-@lru_cache(1)
-def _open_simulator(task: str, kind: type) -> tuple[Callable, SimulatedWorld]:
-    """Return a renderer and a world, which the next recordings of a task use again; loading takes up to a second.
-
-    Raises:
-        ValueError: the scene's seed does not determine the start.
-    """
-    rules = get_task(task)
-    world = rules.begin(0)
-    first = np.concatenate([world.position, rules.agent_pos(world)])
-    world = rules.begin(0, None, world)
-    if not np.allclose(first, np.concatenate([world.position, rules.agent_pos(world)]), atol=1e-6):
-        raise ValueError(
-            f"a seed must determine the start of {task}, but two resets with one seed differ; use the seed in its reset"
-        )
-    return rules.make_renderer(), world
-
-
-def _demonstrate(rules: BaseTask, draw: Callable, world: SimulatedWorld, plan: Plan) -> Iterator[dict]:
-    """Yield the steps of an episode as arrays; TensorDicts would take longer than the simulator."""
-    rng, expert, layout = np.random.default_rng([plan.scene_seed, 1]), rules.demonstrator(world), rules.layout
-    limit = np.array(layout.action_limit, np.float32)
-    if not callable(expert):
-        raise ValueError(f"the demonstrator of {rules.name} must return a function, got {expert!r}")
-    for t in range(layout.steps):
-        agent_pos = np.asarray(rules.agent_pos(world), np.float32)
-        row = {"pixels": draw(world), "agent_pos": agent_pos, "goal": agent_pos[-layout.goal_size :]}
-        row |= {f"dynamics.{name}": getattr(world, name).astype(np.float32) for name in DYNAMICS}
-        action = np.asarray(expert(), np.float32)
-        if action.shape != limit.shape:
-            raise ValueError(
-                f"the demonstrator of {rules.name} must return {len(limit)} entries, got the shape {action.shape}"
-            )
-        noise = plan.noise * rng.standard_normal(len(limit)).astype(np.float32) * limit
-        noise = noise * (not getattr(expert, "exact", False))
-        row |= {"action": (action + noise).clip(-limit, limit), "expert_action": action.clip(-limit, limit)}
-        rules.step([world], [row["action"]])
-        end = {"done": t + 1 == layout.steps or rules.is_over(world), "dropped": world.dropped}
-        end |= {"is_success": rules.is_success(world)}
-        row |= {f"next.{name}": np.array([value], bool) for name, value in end.items()}
-        values = {"reward": rules.reward(world), "position_error": world.position_error}
-        yield row | {f"next.{name}": np.array([value], np.float32) for name, value in values.items()}
 
 
 def mark_pushes(plans: list[Plan], steps: int = EPISODE_STEPS) -> torch.Tensor:

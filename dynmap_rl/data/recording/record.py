@@ -64,7 +64,7 @@ def record_dataset(
     settings = {"task": task, "kind": kind, "episodes": episodes, "eval_episodes": eval_episodes}
     settings |= {"expert": str(expert or task), "format": FORMAT}
     _check_settings(root, settings)
-    parts = root.with_name(f"{root.name}.parts")
+    parts = _parts(root)
     if (root / META).exists() and not parts.exists():
         return root
     try:
@@ -103,7 +103,8 @@ def _check_settings(root: Path, settings: dict) -> None:
             for name, value in settings.items()
             if stored.get(name) != value
         )
-        raise ValueError(f"{root} holds another recording ({changed}); choose another folder or delete it")
+        where = root if root.exists() else _parts(root)
+        raise ValueError(f"{where} holds another recording ({changed}); choose another folder or delete it")
 
 
 def _stored_settings(root: Path) -> dict | None:
@@ -121,8 +122,13 @@ def _stored_settings(root: Path) -> dict | None:
         raise ValueError(
             f"{root} must be a recording or a new folder, got something else; choose another folder or delete it"
         )
-    path = root.with_name(f"{root.name}.parts") / "settings.json"
-    return read_json(path) if path.exists() else None
+    parts = _parts(root)
+    started = any(path.suffix != ".tmp" for path in parts.glob("*_*"))  # a shard is complete
+    return read_json(parts / "settings.json") if started else None
+
+
+def _parts(root: Path) -> Path:
+    return root.with_name(f"{root.name}.parts")
 
 
 def _record(root: Path, parts: Path, settings: dict, workers: int, launcher: str) -> None:

@@ -147,7 +147,8 @@ def _run_shard(shard: Shard) -> tuple[list[Plan], TensorDict]:
                 else "train a better expert with recipes/expert.py"
             )
             raise ValueError(
-                f"{shard.count} of {start} candidates of {shard.task} must succeed, got {len(plans)}; {better}"
+                f"{shard.count} of {start} candidates of {shard.task} must succeed, got {len(plans)}; {better}, and "
+                f"delete {shard.folder.parent}"
             )
         candidates = _plan(shard, shard.number * CANDIDATES_PER_SHARD + start, size)
         episodes = run_plans(shard.task, candidates, shard.expert)

@@ -77,10 +77,15 @@ class FrameRenderer:
         finalizer = weakref.finalize(self, _free, self.canvas, self.context)
         finalizer.atexit = False
         atexit.register(finalizer)  # later than MuJoCo's own, and therefore called before
-        self.scene, self.option = mujoco.MjvScene(model, maxgeom=1000), mujoco.MjvOption()
+        drawn = 2 * (model.ngeom + model.nsite + model.ntendon)  # beyond maxgeom, MuJoCo leaves geoms out
+        self.scene = mujoco.MjvScene(model, maxgeom=max(1000, drawn))
+        self.option = mujoco.MjvOption()
         for flag in FLAGS:
             self.scene.flags[getattr(mujoco.mjtRndFlag, f"mjRND_{flag}")] = 0
         self.rectangle, self.frame = mujoco.MjrRect(0, 0, size, size), np.empty((size, size, 3), np.uint8)
+
+    def __reduce__(self):
+        raise TypeError("an environment that has drawn cannot be copied or pickled; make another one")
 
     def draw(self, data: mujoco.MjData) -> np.ndarray:
         """Draw the state of the model, uint8 ``[size, cameras * size, 3]``."""

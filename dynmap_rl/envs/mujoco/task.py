@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from functools import cached_property
+from numbers import Real
 from typing import Any
 
 import gymnasium
@@ -16,6 +18,7 @@ from .bodies import Body, BodyReader
 from .rendering import Camera, FrameRenderer, find_heavy, find_parts
 
 SIZES = 64, 96, 128
+RESCALE = "wrap the environment in gymnasium.wrappers.RescaleAction(env, -1, 1)"
 ATTEMPTS = 100  # of a start that is not solved yet
 
 
@@ -63,16 +66,20 @@ class MujocoWorld:
         """Simulate one control step.
 
         Raises:
-            ValueError: the step does not last ``dt``, or the simulation is unstable.
+            ValueError: the step does not last ``dt``, as where the environment resets itself, or the simulation is unstable.
         """
         time, before = self.data.time, self.velocity
         self.observation, reward, _, _, self.info = self.env.step(action)
         self.reward, self.steps = float(reward), self.steps + 1
-        if self.steps == 1 and not np.isclose(elapsed := self.data.time - time, self.dt):
-            raise ValueError(f"fps must be {1 / elapsed:g}, the environment's, got {1 / self.dt:g}")
         self.position, self.velocity = self.reader.read(self.data)
         if not (np.isfinite(self.position).all() and np.isfinite(self.velocity).all()):
             raise ValueError(f"positions are not finite after {self.steps} steps: the simulation is unstable")
+        if (elapsed := self.data.time - time) <= 0:
+            raise ValueError(
+                f"the environment resets itself in step {self.steps}; leave out its own limit of steps, and Autoreset"
+            )
+        if not np.isclose(elapsed, self.dt):
+            raise ValueError(f"fps must be {1 / elapsed:g}, the environment's, got {1 / self.dt:g}")
         # MuJoCo's own accelerations are those of an instant, with spikes at contacts.
         self.acceleration = (self.velocity - before) / self.dt
 
@@ -119,16 +126,33 @@ class MujocoTask(BaseTask):
     max_worlds = 16
 
     def __init__(self, image_size: int = 64, cameras: int = 1, arm: bool = False):
+        names = "name", "description", "bodies", "views", "steps", "fps"
+        if missing := [name for name in names if not hasattr(self, name)]:
+            raise ValueError(f"{type(self).__name__} must define {', '.join(missing)}")
+        if not re.fullmatch("[a-z0-9_]+", self.name):
+            raise ValueError(f"name must be of lower-case letters, digits and underscores, got {self.name!r}")
+        for name in ("steps", "fps"):
+            if (value := getattr(self, name)) != int(value) or value < 1:
+                raise ValueError(
+                    f"{name} must be a whole number of at least 1, got {value}; fps depends on the environment's "
+                    "frame_skip"
+                )
+        if not isinstance(self.action_limit, Real):
+            raise ValueError(f"action_limit must be a number, got {self.action_limit!r}; {RESCALE}")
         for name, kind in (("bodies", Body), ("views", Camera)):
             values = getattr(self, name)
             if not (isinstance(values, tuple) and values and all(isinstance(some, kind) for some in values)):
                 raise ValueError(f"{name} must be a tuple of {kind.__name__}, got {values!r}")
             if len({some.name for some in values}) < len(values):
                 raise ValueError(f"{name} must have different names, got {[some.name for some in values]}")
-        if image_size not in SIZES:
-            raise ValueError(f"image_size must be one of {SIZES}, got {image_size}")
-        if cameras not in range(1, len(self.views) + 1):
+        if bad := [view.name for view in self.views if not re.fullmatch("[A-Za-z0-9_]+", view.name)]:
+            raise ValueError(f"names of views must be of letters, digits and underscores, got {bad}")
+        if not isinstance(image_size, int) or image_size not in SIZES:
+            raise ValueError(f"image_size must be one of {SIZES}, got {image_size!r}")
+        if not isinstance(cameras, int) or cameras not in range(1, len(self.views) + 1):
             raise ValueError(f"cameras must be 1 to {len(self.views)}, got {cameras!r}")
+        if not isinstance(arm, bool):
+            raise ValueError(f"arm must be true or false, got {arm!r}")
         self.image_size, self.cameras, self.arm = image_size, self.views[:cameras], arm
 
     @abstractmethod
@@ -199,8 +223,10 @@ class MujocoTask(BaseTask):
             world.attach()
             self.prepare(world)
             world.begin(observation, info)
-            if (shape := np.shape(self.goal(world))) != (3,):
-                raise ValueError(f"goal of {self.name} must return x, y and z, [3], got {list(shape)}")
+            goal = np.asarray(self.goal(world))
+            if goal.shape != (3,) or not np.isfinite(goal).all():
+                got = goal if goal.shape == (3,) else list(goal.shape)
+                raise ValueError(f"goal of {self.name} must return finite x, y and z, [3], got {got}")
             world.position_error = self.distance(world)
             if not self.is_solved(world):
                 return world
@@ -213,7 +239,8 @@ class MujocoTask(BaseTask):
         box = env.action_space
         if box.shape != (size,) or not np.allclose([box.high, -box.low], self.action_limit):
             raise ValueError(
-                f"{self.name} must have actions of {size} entries within {self.action_limit}, got {env.action_space}"
+                f"{self.name} must have actions of {size} entries within {self.action_limit}, got {env.action_space}; "
+                f"name them in action, and set action_limit, or {RESCALE}"
             )
         return world
 
