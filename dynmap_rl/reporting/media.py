@@ -11,7 +11,6 @@ from PIL import Image
 from tensordict.nn import TensorDictModuleBase
 
 from dynmap_rl.data.recording.demonstrators import demonstrate
-from dynmap_rl.data.recording.plans import SCRIPTED, Plan
 from dynmap_rl.envs.delay import FrameDelay
 from dynmap_rl.envs.renderer import Renderer
 from dynmap_rl.envs.task import Task
@@ -68,8 +67,7 @@ def film_demonstrator(task: str, scene_seeds: Sequence[int], path: Path) -> None
         scene_seeds: seeds of the scenes, an episode each.
         path: file to write.
     """
-    plans = [Plan(seed, SCRIPTED) for seed in scene_seeds]
-    save_gif(demonstrate(task, plans)["pixels"], path)
+    save_gif(demonstrate(task, scene_seeds)["pixels"], path)
 
 
 def film_policy(

@@ -13,7 +13,7 @@ from torchrl.envs.utils import check_env_specs
 
 from dynmap_rl.data.recording import demonstrators
 from dynmap_rl.data.recording.demonstrators import demonstrate
-from dynmap_rl.data.recording.plans import plan_demonstrations
+from dynmap_rl.data.recording.plans import plan_demonstrations, run_plans
 from dynmap_rl.envs.protocol import Layout
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
@@ -85,9 +85,9 @@ def test_the_demonstrator_succeeds(own_task):  # noqa: F811
 
 def check_recordings(task):
     plans = plan_demonstrations(task, "train", 0, 4)
-    first = demonstrate(task, plans[2:])
-    demonstrate(task, plans[:2])
-    assert (demonstrate(task, plans[2:]) == first).all()  # in a used simulator
+    first = run_plans(task, plans[2:])
+    run_plans(task, plans[:2])
+    assert (run_plans(task, plans[2:]) == first).all()  # in a used simulator
 
 
 def test_a_recording_does_not_depend_on_those_before(own_task):  # noqa: F811
@@ -280,7 +280,7 @@ def test_a_used_renderer_is_not_copied(own_task):  # noqa: F811
 def test_a_demonstrator_returns_all_entries(own_task, monkeypatch, expert, message):  # noqa: F811
     monkeypatch.setattr(type(get_task(own_task)), "demonstrator", lambda self, world: expert)
     with pytest.raises(ValueError, match=message):
-        demonstrate(own_task, plan_demonstrations(own_task, "train", 0, 1))
+        demonstrate(own_task, [0])
 
 
 @pytest.mark.slow

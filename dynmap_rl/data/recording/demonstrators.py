@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -14,27 +13,24 @@ from dynmap_rl.envs.protocol import BaseTask, SimulatedWorld
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.keys import DYNAMICS
 
-if TYPE_CHECKING:
-    from .plans import Plan
 
-
-def demonstrate(task: str, plans: list[Plan]) -> TensorDict:
-    """Run the demonstrator of a task by the plans, one episode after the other.
-
-    Noise is in units of the largest action.
+def demonstrate(task: str, seeds: Sequence[int], noise: Sequence[float] | None = None) -> TensorDict:
+    """Run the demonstrator of a task, one episode after the other.
 
     Args:
         task: name of the task.
-        plans: one plan for each episode.
+        seeds: seed of the scene of each episode.
+        noise: standard deviation of the noise on the actions of each episode, in units of the largest action; by default
+            none.
 
     Returns:
-        ``[E, T]``, as :func:`run_plans` returns them.
+        ``[E, T]``, as :func:`dynmap_rl.data.recording.plans.run_plans` returns them.
     """
     rules, episodes = get_task(task), []
     draw, world = _open_simulator(task, type(rules))
-    for plan in plans:
-        world = rules.begin(plan.scene_seed, None, world)
-        rows = list(_demonstrate(rules, draw, world, plan.scene_seed, plan.noise))
+    for seed, own in zip(seeds, noise or [0.0] * len(seeds), strict=True):
+        world = rules.begin(seed, None, world)
+        rows = list(_demonstrate(rules, draw, world, seed, own))
         steps = {key: torch.from_numpy(np.stack([row[key] for row in rows])) for key in rows[0]}
         episodes.append(TensorDict(steps, [len(rows)]).unflatten_keys("."))
     out = torch.stack(episodes)

@@ -136,7 +136,7 @@ def run_plans(task: str, plans: list[Plan], expert: str | Path | None = None) ->
         without noise and pushes, and under ``next`` ``reward``, ``done``, ``is_success``, ``dropped``, ``position_error``.
     """
     if get_task(task).has_demonstrator:
-        return demonstrate(task, plans)
+        return demonstrate(task, [plan.scene_seed for plan in plans], [plan.noise for plan in plans])
     n = len(plans)
     env = DynmapBatchedEnv(task, n, from_pixels=True)
     td = env.reset(TensorDict({"scene_seed": torch.tensor([p.scene_seed for p in plans])}, [n]))
