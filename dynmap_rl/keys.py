@@ -18,10 +18,11 @@ NEEDED = {  # columns that every dataset of the tasks has, by the key that they 
     "action": "action",
     **{("dynamics", name): f"dynamics.{name}" for name in DYNAMICS},
 }
+FOUND = "dynamics.found"  # what was found in the frames that dynamics were derived from
 OPTIONAL = {  # columns that a dataset may lack, likewise
     ("next", "reward"): "next.reward",
     ("next", "is_success"): "next.success",
     "disturbed": "disturbed",
     "expert_action": "expert_action",
-    "labelled": "dynamics.found",
+    "labelled": FOUND,
 }

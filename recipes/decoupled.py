@@ -79,9 +79,9 @@ def main(config: Config) -> None:
     check_corrections(config.policy, config.task)
     if config.dataset:
         check_dataset(config.dataset, config.task)
-    if not config.pretrained:
-        check_windows(config.world_model, task.layout.steps, "world_model")
     world_model = load_pretrained(config) if config.pretrained else None
+    if world_model is None:
+        check_windows(config.world_model, task.layout.steps, "world_model")
     origin = {"task": config.task, "training": "decoupled"}
     name = f"{config.world_model.supervision.replace(',', '_')}_{config.policy.kind}"
     folder = config.run or Path("runs/decoupled") / task.name / name

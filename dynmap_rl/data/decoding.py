@@ -12,7 +12,7 @@ import torch
 from tensordict import TensorDict
 
 from dynmap_rl.envs.protocol import Layout
-from dynmap_rl.keys import CAMERAS, NEEDED, OPTIONAL
+from dynmap_rl.keys import CAMERAS, FOUND, NEEDED, OPTIONAL
 
 from .format.images import decode_image, image_files
 from .format.reading import iterate_tables, read_column, read_table
@@ -130,7 +130,7 @@ def choose_columns(root: Path, info: dict, layout: Layout) -> dict:
     sizes = dict.fromkeys(OPTIONAL.values(), 1) | {"expert_action": len(layout.action)}
     sizes |= {"observation.state": len(layout.state), "action": len(layout.action)}
     sizes |= {f"dynamics.{quantity}": len(names) for quantity, names in layout.dynamics.items()}
-    sizes["dynamics.found"] = len(layout.position)
+    sizes[FOUND] = len(layout.position)
     for name, size in sizes.items():
         if name in features and (shape := tuple(features[name]["shape"])) != (size,):
             raise ValueError(

@@ -11,7 +11,7 @@ import numpy as np
 
 from dynmap_rl.envs.task import BODIES, LAYOUT
 from dynmap_rl.envs.tasks import get_task
-from dynmap_rl.keys import DYNAMICS
+from dynmap_rl.keys import DYNAMICS, FOUND
 
 from .camera import FrameSource, choose_view, read_motion
 from .demonstrations import DERIVED, META, find_layout, find_meta
@@ -96,9 +96,9 @@ def add_dynamics(
 ) -> dict:
     """Copy a LeRobot v3.0 dataset and add the columns ``dynamics.position``, ``.velocity`` and ``.acceleration``.
 
+    The columns (float32) are computed for one episode at a time, in float64, with the times of the column ``timestamp``.
     From frames there is also ``dynamics.found`` (bool): whether what an entry belongs to was found in the frame. Other
-    positions are interpolated, and trainings leave these entries out. The columns (float32) are computed for one episode at a time, in float64, with the times of the column ``timestamp``.
-    The new folder appears when it is complete. Videos are hard-linked where the file system can; all other files are
+    positions are interpolated, and trainings leave these entries out. The new folder appears when it is complete. Videos are hard-linked where the file system can; all other files are
     copied. A recording of a task stays one, and can be trained on with the recipes of the tasks: its constants of
     normalisation and the names of its dynamics are written anew. ``meta/dynamics.json`` has all settings, and
     the quality of the columns.
@@ -186,8 +186,8 @@ def add_dynamics(
         for entry in angles:
             align_turns(values["position"][:, own][:, entry], list(rows.values()), motion.period)
     new = {f"dynamics.{q}": v.astype(np.float32) for q, v in values.items()}
-    if view or "dynamics.found" in info["features"]:
-        new["dynamics.found"] = seen
+    if view or FOUND in info["features"]:
+        new[FOUND] = seen
     meta = _describe(meta, planar, names, values, rows) if meta else None
     there = {
         q: read_column(root, info, table, f"dynamics.{q}", np.float64).numpy()

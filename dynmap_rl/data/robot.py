@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from dynmap_rl.keys import DYNAMICS
+from dynmap_rl.keys import DYNAMICS, FOUND
 from dynmap_rl.utils.settings import parse_numbers
 
 from .format.frames import choose_camera, iterate_frames
@@ -138,8 +138,8 @@ def _read_numbers(layout: dict) -> tuple[dict, dict[int, slice]]:
     pushes = info["features"].get("disturbed", {})
     if (pushes.get("dtype"), pushes.get("shape")) == ("bool", [1]):
         columns["disturbed"] = "disturbed"
-    if "dynamics.found" in info["features"]:
-        columns["labelled"] = "dynamics.found"
+    if FOUND in info["features"]:
+        columns["labelled"] = FOUND
     goal, entries = layout["goal"] or ("action", [])
     table = read_table(root, info, list({*columns.values(), goal}))
     numbers = {key: read_column(root, info, table, name) for key, name in (columns | {"goal": goal}).items()}

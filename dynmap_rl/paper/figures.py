@@ -19,6 +19,7 @@ from dynmap_rl.keys import DYNAMICS
 from dynmap_rl.modules.normalization import Normalizer
 from dynmap_rl.modules.supervision import row_name
 from dynmap_rl.reporting.figures import COMPONENTS, UNITS, moving_steps, plt, save_figure
+from dynmap_rl.utils.files import read_json
 
 FRAMES = 8  # in a film strip
 
@@ -163,6 +164,23 @@ def loss_panels(task: str) -> dict[str, dict[str, list[str]]]:
             f"without {quantity}": cells(among=[s for s in supervisions if quantity not in s]),
         }
     return panels
+
+
+def find_losses(panels: dict[str, dict[str, list[str]]], folder: Path) -> dict[str, dict]:
+    """Return the results of the panels' runs that have losses, by name, and print how many there are.
+
+    Raises:
+        ValueError: there is none.
+    """
+    names = {name for groups in panels.values() for group in groups.values() for name in group}
+    results = {name: read_json(path) for name in names if (path := folder / f"{name}.json").exists()}
+    results = {name: result for name, result in results.items() if "losses" in result["results"][0]}
+    if not results:
+        raise ValueError(
+            f"{folder} must have results with losses; run python recipes/paper/tables.py --results runs/results"
+        )
+    print(f"{len(results)} of {len(names)} results are there")
+    return results
 
 
 def plot_losses(

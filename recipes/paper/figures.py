@@ -5,8 +5,7 @@
 
 Fig. 2 to 4 show demonstrations, Fig. 6 and 9 predictions of a world model of task 1 on tasks 1 and 3, Fig. 7 policy
 losses, Fig. 8 closed-loop episodes; Fig. 1 and 5 of the paper are diagrams. The figure distributions shows angles and
-angular velocities in the demonstrations, failures the failed episodes of some cells by cause; both come with JSON. The page
-report.html shows all figures.
+angular velocities in the demonstrations, failures the failed episodes of some cells by cause; both come with JSON.
 """
 
 import sys
@@ -145,18 +144,10 @@ def draw_prediction(config: Config, datasets: dict, task: str, name: str) -> Non
 
 def draw_fig7(config: Config, datasets: dict) -> None:
     """Draw the policies' losses, on held-out demonstrations and in training."""
-    from dynmap_rl.paper.figures import loss_panels, plot_losses
-    from dynmap_rl.utils.files import read_json
+    from dynmap_rl.paper.figures import find_losses, loss_panels, plot_losses
 
     panels = loss_panels(ONE)
-    names = {cell for groups in panels.values() for group in groups.values() for cell in group}
-    found = {name: read_json(path) for name in names if (path := config.results / f"{name}.json").exists()}
-    found = {name: result for name, result in found.items() if "losses" in result["results"][0]}
-    if not found:
-        raise ValueError(
-            f"{config.results} must have results with losses; run python recipes/paper/tables.py --results runs/results"
-        )
-    print(f"{len(found)} of {len(names)} results are there")
+    found = find_losses(panels, config.results)
     plot_losses(panels, found, config.output / "fig7.png")
     plot_losses(panels, found, config.output / "fig7_training.png", "training")
     print(f"written: {config.output}/fig7_training.png")

@@ -160,6 +160,14 @@ def test_unfinished_shards_of_other_settings_are_refused(tmp_path, changes, mess
         record_dataset(tmp_path / "d", episodes=4, eval_episodes=2)
 
 
+def test_episodes_that_a_person_has_recorded_are_kept(tmp_path):
+    write_json(tmp_path / "d.parts" / "settings.json", {"task": "balance_reaching", "kind": "human"})
+    (tmp_path / "d.parts" / "0000").mkdir()
+    with pytest.raises(ValueError, match="d.parts holds another recording"):
+        record_dataset(tmp_path / "d", episodes=1, eval_episodes=1)
+    assert (tmp_path / "d.parts" / "0000").exists()
+
+
 def test_two_recordings_of_one_folder_are_refused(tmp_path):
     (tmp_path / "d.parts").mkdir()
     with FileLock(tmp_path / "d.parts" / ".lock"), pytest.raises(ValueError, match="another process"):

@@ -13,7 +13,7 @@ from dynmap_rl.utils.files import lock_folder, read_json, write_json
 
 from ..demonstrations import META, load_meta
 from .plans import Plan
-from .shards import ROWS, Shard, merge_shards, write_shard
+from .shards import ROWS, Shard, merge_shards, parts_folder, write_shard
 
 KIND = "human"
 
@@ -37,7 +37,7 @@ def keep_episode(root: str | Path, task: str, episode: TensorDict, scene_seed: i
     open_folder(root, task)
     shards = list_shards(root, task)
     number = 1 + max((int(shard.folder.name) for shard in shards), default=-1)
-    write_shard(_parts(root) / f"{number:04d}", task, [Plan(scene_seed, checkpoint=KIND)], episode)
+    write_shard(parts_folder(root) / f"{number:04d}", task, [Plan(scene_seed, checkpoint=KIND)], episode)
     return len(shards) + 1
 
 
@@ -63,7 +63,7 @@ def publish_episodes(root: str | Path, task: str) -> Path:
         )
     train = len(shards) - max(1, len(shards) // 10)
     shards = shards[:train] + [replace(shard, split="eval") for shard in shards[train:]]
-    temporary = merged, old, _ = [_parts(root) / f"{name}.tmp" for name in ("merged", "old", "cache")]
+    temporary = merged, old, _ = [parts_folder(root) / f"{name}.tmp" for name in ("merged", "old", "cache")]
     for leftover in temporary:
         shutil.rmtree(leftover, ignore_errors=True)
     settings = {"task": task, "expert": KIND, "kind": KIND, "episodes": train}
@@ -87,7 +87,7 @@ def open_folder(root: str | Path, task: str) -> None:
         ValueError: ``root`` is something else than a person's recording of this task, or another process records to it.
     """
     root, settings = Path(root), {"kind": KIND, "task": task}
-    stored, path = settings, _parts(root) / "settings.json"
+    stored, path = settings, parts_folder(root) / "settings.json"
     if (root / META).exists():
         stored = load_meta(root)
     elif root.exists() and (not root.is_dir() or any(root.iterdir())):
@@ -98,7 +98,7 @@ def open_folder(root: str | Path, task: str) -> None:
         stored = read_json(path)
     if (root / META).exists() and len(list_shards(root, task)) < (there := len(stored["episodes"])):
         raise ValueError(
-            f"{_parts(root)} must hold the {there} episodes of {root}, to merge them with new ones, got fewer; choose "
+            f"{parts_folder(root)} must hold the {there} episodes of {root}, to merge them with new ones, got fewer; choose "
             "another folder"
         )
     if any(stored.get(name) != value for name, value in settings.items()):
@@ -106,13 +106,13 @@ def open_folder(root: str | Path, task: str) -> None:
             f"{root} must be a recording of kind {KIND} of {task}, got {stored.get('kind')} of {stored.get('task')}; "
             "choose another folder"
         )
-    lock_folder(_parts(root))
+    lock_folder(parts_folder(root))
     write_json(path, settings)
 
 
 def list_shards(root: str | Path, task: str) -> list[Shard]:
     """Return the kept episodes, each a dataset of its own."""
-    folders = sorted(path for path in _parts(root).glob("[0-9]*") if path.suffix != ".tmp")
+    folders = sorted(path for path in parts_folder(root).glob("[0-9]*") if path.suffix != ".tmp")
     return [Shard(folder, task, KIND, KIND, "train", number, 1) for number, folder in enumerate(folders)]
 
 
@@ -121,8 +121,3 @@ def next_scene(root: str | Path, task: str) -> int:
     rows = [row for shard in list_shards(root, task) for row in read_json(shard.folder / ROWS, list)]
     numbers = [row["scene_seed"] - scene_seed("train", 0) for row in rows]
     return 1 + max((n for n in numbers if 0 <= n < SEEDS_PER_SPLIT), default=-1)
-
-
-def _parts(root: str | Path) -> Path:
-    root = Path(root)
-    return root.with_name(f"{root.name}.parts")

@@ -19,7 +19,7 @@ from dynmap_rl.utils.processes import open_pool, share
 
 from ..demonstrations import DERIVED, FORMAT, META, load_meta
 from .plans import find_checkpoints
-from .shards import Shard, merge_shards, record_shard
+from .shards import Shard, merge_shards, parts_folder, record_shard
 
 KINDS = ("demonstrations", "undisturbed", "exploration")
 SHARD_EPISODES = 25
@@ -64,7 +64,7 @@ def record_dataset(
     settings = {"task": task, "kind": kind, "episodes": episodes, "eval_episodes": eval_episodes}
     settings |= {"expert": str(expert or task), "format": FORMAT}
     _check_settings(root, settings)
-    parts = _parts(root)
+    parts = parts_folder(root)
     if (root / META).exists() and not parts.exists():
         return root
     try:
@@ -103,7 +103,7 @@ def _check_settings(root: Path, settings: dict) -> None:
             for name, value in settings.items()
             if stored.get(name) != value
         )
-        where = root if root.exists() else _parts(root)
+        where = root if (root / META).exists() else parts_folder(root)
         raise ValueError(f"{where} holds another recording ({changed}); choose another folder or delete it")
 
 
@@ -122,13 +122,11 @@ def _stored_settings(root: Path) -> dict | None:
         raise ValueError(
             f"{root} must be a recording or a new folder, got something else; choose another folder or delete it"
         )
-    parts = _parts(root)
-    started = any(path.suffix != ".tmp" for path in parts.glob("*_*"))  # a shard is complete
+    parts = parts_folder(root)
+    started = any(
+        path.is_dir() and path.suffix != ".tmp" for path in parts.glob("*")
+    )  # an episode is complete
     return read_json(parts / "settings.json") if started else None
-
-
-def _parts(root: Path) -> Path:
-    return root.with_name(f"{root.name}.parts")
 
 
 def _record(root: Path, parts: Path, settings: dict, workers: int, launcher: str) -> None:

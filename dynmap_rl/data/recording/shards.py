@@ -49,6 +49,12 @@ class Shard:
     count: int
 
 
+def parts_folder(root: str | Path) -> Path:
+    """Return the folder of the shards that become the dataset ``root``."""
+    root = Path(root)
+    return root.with_name(f"{root.name}.parts")
+
+
 def record_shard(shard: Shard) -> None:
     """Roll the experts out and write the shard.
 
