@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 
 import torch
@@ -16,6 +17,12 @@ from dynmap_rl.objectives.imitation import imitation_loss
 GROUPS = {"": (0, 1), "_angle": (2,)}  # entries of a body's dynamics (x, y, theta) that share a unit
 
 
+def known_dynamics(episodes: TensorDictBase, quantity: str) -> torch.Tensor:
+    """Return a quantity of the dynamics ``[E, T, D]``, NaN where ``labelled`` says that it is not known."""
+    values, known = episodes["dynamics", quantity], episodes.get("labelled", None)
+    return values if known is None else values.where(known, torch.nan)
+
+
 @torch.no_grad()
 def prediction_errors(
     world_model: WorldModel, episodes: TensorDictBase, batch: int = 10, by_entry: bool = False
@@ -24,7 +31,8 @@ def prediction_errors(
 
     Args:
         world_model: what predicts.
-        episodes: TensorDict ``[E, T]`` with ``pixels``, ``action`` and ``dynamics``.
+        episodes: TensorDict ``[E, T]`` with ``pixels``, ``action`` and ``dynamics``; dynamics that ``labelled`` says are
+            not known are left out.
         batch: episodes at a time.
         by_entry: give the error of every entry of the dynamics instead of the means.
 
@@ -33,24 +41,25 @@ def prediction_errors(
         absolute error of x and y, ``error_position`` (m, m/s, m/s^2), and of the angles, ``error_position_angle`` (rad,
         rad/s, rad/s^2); with ``by_entry`` those of the single entries, ``error_position_0`` and so on.
     """
-    sums: dict[str, float] = {}
+    sums, counts = Counter(), Counter()
     device = next(world_model.parameters()).device
     for chunk in episodes.split(batch):
         chunk = chunk.to(device)
         states = world_model.predict(world_model.encode(chunk["pixels"], mixed=True), chunk["action"])
         some = [s[:, 1::10] for s in states]  # a tenth of the frames is enough
         error = world_model.decode_pixels(*some) - chunk["pixels"][:, 1::10] / 255
-        errors = {"rgb": error.square().flatten(2).mean(-1).sqrt().mean()}
+        errors = {"rgb": error.square().flatten(2).mean(-1).sqrt()}
         for name, value in world_model.decode_dynamics(*states).items():
-            difference = (value - chunk["dynamics", name])[:, 1:].abs()
+            difference = (value - known_dynamics(chunk, name))[:, 1:].abs()
             size = difference.shape[-1]
             groups = {g: [i for i in range(size) if i % 3 in entries] for g, entries in GROUPS.items()}
             for group, entries in ({f"_{i}": [i] for i in range(size)} if by_entry else groups).items():
                 if entries:  # a point has no angle
-                    errors[f"{name}{group}"] = difference[..., entries].mean()
+                    errors[f"{name}{group}"] = difference[..., entries]
         for name, value in errors.items():
-            sums[f"error_{name}"] = sums.get(f"error_{name}", 0.0) + value.item() * len(chunk) / len(episodes)
-    return sums
+            sums[f"error_{name}"] += value.nansum().item()
+            counts[f"error_{name}"] += value.isfinite().sum().item()
+    return {name: sums[name] / (counts[name] or torch.nan) for name in counts}
 
 
 @torch.no_grad()

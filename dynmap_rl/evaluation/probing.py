@@ -10,6 +10,8 @@ from dynmap_rl.keys import DYNAMICS
 from dynmap_rl.modules.actor import STATES
 from dynmap_rl.modules.world_model import WorldModel
 
+from .errors import known_dynamics
+
 GOOD = 0.75  # R^2 of the velocities
 
 
@@ -27,11 +29,15 @@ def probe(world_model: WorldModel, train: TensorDictBase, test: TensorDictBase) 
     Returns:
         For each of ``latent``, ``hidden1``, ``hidden2`` and each quantity a list of R^2, one for each entry (cart x, y,
         theta, block x, y, theta): 1 is a perfect map, 0 as good as the mean. Steps t = 0, at which memory is empty, are
-        left out. R^2 of an entry that rests in the test episodes is NaN.
+        left out, and so are values that ``labelled`` says are not known. R^2 of an entry that rests in the test episodes,
+        or is not known in any, is NaN.
     """
     inputs = [_states(world_model, episodes) for episodes in (train, test)]
     targets = [
-        torch.cat([episodes["dynamics", quantity][:, 1:] for quantity in DYNAMICS], -1).flatten(0, 1).double()
+        torch.cat([known_dynamics(episodes, name)[:, 1:] for name in DYNAMICS], -1)
+        .flatten(0, 1)
+        .double()
+        .cpu()
         for episodes in (train, test)
     ]
     sizes, result = [test["dynamics", quantity].shape[-1] for quantity in DYNAMICS], {}
@@ -74,10 +80,19 @@ def _states(world_model: WorldModel, episodes: TensorDictBase) -> dict[str, torc
 
 
 def _explained(x: torch.Tensor, x_test: torch.Tensor, y: torch.Tensor, y_test: torch.Tensor) -> torch.Tensor:
-    """Fit a linear map from ``x`` ``[N, F]`` to ``y`` ``[N, D]`` by least squares; return R^2 ``[D]`` on the test data."""
+    """Fit linear maps from ``x`` ``[N, F]`` to ``y`` ``[N, D]``, NaN where not known; return R^2 ``[D]`` on the test data."""
+    masks, which = y.isfinite().unique(dim=1, return_inverse=True)
+    result = y.new_full(which.shape, torch.nan)
+    for i, known in enumerate(masks.T):  # entries that are known in the same steps have one fit
+        if known.any():
+            result[which == i] = _explain(x[known], x_test, y[known][:, which == i], y_test[:, which == i])
+    return result
+
+
+def _explain(x: torch.Tensor, x_test: torch.Tensor, y: torch.Tensor, y_test: torch.Tensor) -> torch.Tensor:
     mean, center = x.mean(0), y.mean(0)
     # This driver accepts constant states too.
     weights = torch.linalg.lstsq(x - mean, y - center, driver="gelsd").solution
     rest = y_test - center - (x_test - mean) @ weights
-    total = (y_test - y_test.mean(0)).square().sum(0)
-    return 1 - rest.square().sum(0) / total.where(total > 0, torch.nan)
+    total = (y_test - y_test.nanmean(0)).square().nansum(0)
+    return 1 - rest.square().nansum(0) / total.where(total > 0, torch.nan)

@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDictBase
 
 from dynmap_rl.data.robot import describe_robot_dataset
+from dynmap_rl.evaluation.errors import known_dynamics
 from dynmap_rl.evaluation.probing import judged_text
 from dynmap_rl.modules.supervision import row_name
 from dynmap_rl.modules.world_model import WorldModel
@@ -57,7 +58,7 @@ def write_robot_report(
         The content of ``eval.json``. ``held_out`` has means over the seeds: ``rgb`` (root mean square, 0 to 1),
         ``imitation_l1`` (normalised) and, in the dataset's units, the mean absolute error of every entry of the action
         and of the supervised dynamics, one step ahead. ``spread`` has the mean absolute error of the best constant, and
-        ``change`` that of the value one step earlier.
+        ``change`` that of the value one step earlier. Dynamics that were not found in the frames are left out.
 
     Raises:
         ValueError: a seed was evaluated with another world model.
@@ -123,13 +124,13 @@ def robot_row_text(result: dict) -> str:
 
 
 def _values(episodes: TensorDictBase, quantity: str) -> torch.Tensor:
-    return episodes["action" if quantity == "action" else ("dynamics", quantity)]
+    return episodes["action"] if quantity == "action" else known_dynamics(episodes, quantity)
 
 
 def _change(episodes: TensorDictBase, quantity: str) -> list[float]:
-    return _values(episodes, quantity).diff(dim=1).abs().mean((0, 1)).tolist()
+    return _values(episodes, quantity).diff(dim=1).abs().nanmean((0, 1)).tolist()
 
 
 def _spread(episodes: TensorDictBase, quantity: str) -> list[float]:
     values = _values(episodes, quantity).flatten(0, 1)
-    return (values - values.median(0).values).abs().mean(0).tolist()
+    return (values - values.nanmedian(0).values).abs().nanmean(0).tolist()

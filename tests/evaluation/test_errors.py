@@ -1,5 +1,7 @@
 """Errors on held-out episodes, against numbers by hand."""
 
+import math
+
 import pytest
 import torch
 from small import CONSTANTS, load, make_episodes, make_model
@@ -33,6 +35,21 @@ def test_prediction_errors_are_means_over_steps_with_a_prediction(episodes):
     by_entry = prediction_errors(model, episodes, batch=2, by_entry=True)
     entries = [by_entry[f"error_position_{i}"] for i in range(6)]
     torch.testing.assert_close(torch.tensor(entries), error, rtol=1e-3, atol=1e-4)
+
+
+def test_dynamics_that_were_not_found_are_left_out(episodes):
+    model, episodes = make_model().eval(), episodes.clone()
+    known = torch.ones_like(episodes["dynamics", "position"], dtype=torch.bool)
+    known[0, 3:5, 0], known[..., 5] = False, False
+    with torch.no_grad():
+        states = model.predict(model.encode(episodes["pixels"], mixed=True), episodes["action"])
+        error = (model.decode_dynamics(*states)["position"] - episodes["dynamics", "position"])[:, 1:].abs()
+    episodes["labelled"] = known
+    episodes["dynamics", "position"][~known] = 1e6
+    found = prediction_errors(model, episodes, batch=1, by_entry=True)
+    assert found["error_position_0"] == pytest.approx(error[..., 0][known[:, 1:, 0]].mean().item(), rel=1e-3)
+    assert found["error_position_1"] == pytest.approx(error[..., 1].mean().item(), rel=1e-3)
+    assert math.isnan(found["error_position_5"]), "never found"
 
 
 @torch.no_grad()

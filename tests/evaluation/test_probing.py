@@ -23,10 +23,18 @@ def test_r2_of_linear_independent_and_constant_states(monkeypatch):
     assert min(r2["latent"]["position"]) > 0.999
     assert max(r2["hidden1"]["velocity"]) < 0.1
     assert max(r2["hidden2"]["velocity"]) < 1e-9, "a constant is no better than the mean"
+    states = {len(part): features(None, part) for part in (episodes[:30], episodes[30:])}
     episodes["dynamics", "velocity"][..., 2] = 0.5
     resting = probing.probe(None, episodes[:30], episodes[30:])
     assert math.isnan(resting["latent"]["velocity"][2])
     assert math.isfinite(probing.judge_states(resting)["r2"])
+
+    known = torch.rand(episodes["dynamics", "position"].shape, generator=generator) > 0.2
+    episodes["dynamics", "position"][~known] = 1e6
+    monkeypatch.setattr(probing, "compute_features", lambda _, episodes: states[len(episodes)])
+    assert min(probing.probe(None, episodes[:30], episodes[30:])["latent"]["position"]) < 0.9
+    found = probing.probe(None, *(part for part in episodes.set("labelled", known).split([30, 10])))
+    assert min(found["latent"]["position"]) > 0.999, "what is not known is no truth"
 
 
 def test_the_best_state_decides():
