@@ -57,7 +57,7 @@ def main(config: Config) -> None:
     """Train, evaluate and report."""
     if config.compute.launcher == "ray":
         return train_by_ray(main, config, sys.argv)
-    from dynmap_rl.data.demonstrations import load_dataset, load_demonstrations
+    from dynmap_rl.data.demonstrations import load_demonstrations
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.evaluation.protocol import judge_in_closed_loop
     from dynmap_rl.paper.published import paper_numbers
@@ -90,16 +90,16 @@ def main(config: Config) -> None:
     augmentation = choose_augmentation(task, config.training.augmentation, imitated=True)
     training = replace(config.training, augmentation=augmentation)
     config = replace(config, training=training)
+    load = partial(load_demonstrations, dataset, config.cache)
     world_model = train_seeds(
-        partial(load_demonstrations, dataset, config.cache), folder,
-        config.world_model, config.policy, training,
+        load, folder, config.world_model, config.policy, training,
         judge=partial(judge_in_closed_loop, task=config.task, settings=config.eval),
         seeds=seeds, compute=config.compute, logger=config.logger,
     )  # fmt: skip
     if leave_ranks():
         return
     result = write_report(
-        folder, world_model, load_dataset(dataset, "eval", config.cache), seeds,
+        folder, world_model, load()[0]["eval"], seeds,
         task=config.task, dataset=dataset, policy=config.policy.kind,
         origin={"task": config.task, "training": "end_to_end"},
         settings=plain_settings(config), command=command_line(sys.argv), compare=paper_numbers,

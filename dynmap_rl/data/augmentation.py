@@ -82,11 +82,13 @@ def _transform_pixels(
     pixels: torch.Tensor, mirror: torch.Tensor, shift: torch.Tensor, channels: torch.Tensor
 ) -> torch.Tensor:
     # Each output pixel is read from a row, a column and a channel. Rows point down, y points up.
-    size = pixels.shape[-1]
-    grid = torch.arange(size, device=pixels.device)
-    columns = (grid - shift[:, :1]).clamp(0, size - 1)  # (B, W)
-    columns = torch.where(mirror[:, None], size - 1 - columns, columns)
-    rows = (grid + shift[:, 1:]).clamp(0, size - 1)
-    source = (channels[:, :, None, None] * size + rows[:, None, :, None]) * size + columns[:, None, None, :]
+    height, width = pixels.shape[-2:]
+    across, down = (torch.arange(size, device=pixels.device) for size in (width, height))
+    columns = (across - shift[:, :1]).clamp(0, width - 1)  # (B, W)
+    columns = torch.where(mirror[:, None], width - 1 - columns, columns)
+    rows = (down + shift[:, 1:]).clamp(0, height - 1)
+    source = (channels[:, :, None, None] * height + rows[:, None, :, None]) * width + columns[
+        :, None, None, :
+    ]
     index = source.flatten(1)[:, None].expand(-1, pixels.shape[1], -1)
     return pixels.flatten(2).gather(2, index).view_as(pixels)

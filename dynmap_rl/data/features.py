@@ -26,18 +26,23 @@ def compute_features(
 
     Returns:
         ``[E, T]`` with ``latent``, ``hidden1``, ``hidden2``, ``goal``, the ``action`` to imitate, and ``disturbed`` bool
-        ``[..., 1]``: steps that imitation leaves out (see :func:`dynmap_rl.objectives.imitation.find_target`).
+        ``[..., 1]``: steps that imitation leaves out (see :func:`dynmap_rl.objectives.imitation.find_target`), and
+        ``step_count`` ``[..., 1]``, by default from 0.
     """
     device = next(world_model.parameters()).device
     target, ignore = find_target(episodes)
     ignore = torch.zeros(*episodes.shape, 1, dtype=torch.bool) if ignore is None else ignore
     episodes = episodes.copy().set("expert_action", target).set("disturbed", ignore)
+    if "step_count" not in episodes.keys():
+        steps = torch.arange(episodes.shape[1], device=episodes.device)
+        episodes["step_count"] = steps[:, None].expand(*episodes.shape, 1)
     parts = []
     for chunk in tqdm(episodes.split(batch), "states", leave=False):
         chunk = chunk.to(device)
         latent = world_model.encode(chunk["pixels"], mixed=True)
         _, hidden1, hidden2 = world_model.predict(latent, chunk["action"])
         features = {"latent": latent, "hidden1": hidden1, "hidden2": hidden2}
-        chunk = chunk.select("expert_action", "goal", "disturbed").rename_key_("expert_action", "action")
+        chunk = chunk.select("expert_action", "goal", "disturbed", "step_count")
+        chunk = chunk.rename_key_("expert_action", "action")
         parts.append(TensorDict(features, chunk.shape).update(chunk))
     return torch.cat(parts)

@@ -56,9 +56,9 @@ TURNS = {"velocity": 1.0, "acceleration": 10.0}  # rad/s, rad/s^2
 
 
 def layout_constants(episodes: TensorDictBase, layout: Layout) -> dict[str, dict[str, list[float]]]:
-    """Compute the range of every quantity of bodies in three dimensions.
+    """Compute the range of every quantity of the bodies of a task that is not in the plane.
 
-    The three entries of a point or a vector share the width of their ranges, which holds all but one in a thousand of
+    The three entries of a point or a vector, where all come in threes, share the width of their ranges, which holds all but one in a thousand of
     the values at either end, and is at least 0.1 m, 0.2 m/s and 2 m/s^2, or 2 rad/s and 20 rad/s^2. So a body that hardly
     moves along an axis, or hardly turns, does not have its noise enlarged. Axes of bodies and actions have their natural
     ranges.
@@ -78,7 +78,10 @@ def layout_constants(episodes: TensorDictBase, layout: Layout) -> dict[str, dict
         low, high = np.quantile(values.double().numpy(), [0.001, 0.999], axis=0)
         turning = np.array(["_omega_" in name for name in entries])
         least = np.where(turning, TURNS.get(quantity, 0.0), FLOORS[quantity])
-        half = np.maximum((high - low).reshape(-1, 3).max(1).repeat(3) / 2, least)
+        width = high - low
+        if len(width) % 3 == 0:
+            width = width.reshape(-1, 3).max(1).repeat(3)
+        half = np.maximum(width / 2, least)
         middle = (low + high) / 2
         axis = np.array(["axis_" in name for name in entries])
         middle, half = np.where(axis, 0.0, middle), np.where(axis, 1.0, half)

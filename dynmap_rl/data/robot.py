@@ -105,7 +105,8 @@ def load_robot_dataset(
         every quantity of the dynamics). Pieces are ``[P, T]``: ``pixels`` uint8 ``[P, T, 3, S, cameras * S]``, ``action``
         ``[P, T, A]``, ``goal`` ``[P, T, G]`` (G = 0 without a goal), ``("dynamics", quantity)`` ``[P, T, D]`` for the
         columns that the dataset has, float32 in its units, ``disturbed`` bool ``[P, T, 1]`` where the dataset has such a
-        column of flags, ``labelled`` bool ``[P, T, D]`` likewise (see :func:`dynmap_rl.data.load_dataset`), and ``episode`` int64 ``[P, T]``, the episode's index.
+        column of flags, ``labelled`` bool ``[P, T, D]`` likewise (see :func:`dynmap_rl.data.load_dataset`), ``episode`` int64 ``[P, T]``, the
+        episode's index, and ``step_count`` int64 ``[P, T, 1]``, the number of the step in its episode.
 
     Raises:
         ValueError: the dataset is missing or damaged, or fewer than two episodes are long enough.
@@ -122,6 +123,7 @@ def load_robot_dataset(
             own = {key: values[rows[episode]] for key, values in numbers.items()}
             own["pixels"] = torch.from_numpy(frames).permute(0, 3, 1, 2)
             own["episode"] = torch.full((len(frames),), episode)
+            own["step_count"] = torch.arange(len(frames))[:, None]
             own = TensorDict(own, [len(frames)])
             parts[name] += [own[start : start + steps] for start in _starts(len(frames), steps)]
     episodes = {name: torch.stack(pieces).contiguous() for name, pieces in parts.items()}

@@ -25,6 +25,9 @@ class Layout:
         image_size: side of a frame in pixels.
         cameras: names of the cameras; their frames stand side by side in ``pixels``.
         robot: what the actions move, as datasets name it.
+
+    Raises:
+        ValueError: ``state`` does not end with the goal.
     """
 
     steps: int
@@ -37,6 +40,11 @@ class Layout:
     image_size: int = 64
     cameras: tuple[str, ...] = ("front",)
     robot: str = "dynmap_cart"
+
+    def __post_init__(self):
+        goal = [name for name in self.state if name.startswith("goal_")]
+        if not goal or self.state[-len(goal) :] != tuple(goal):
+            raise ValueError(f"state must end with the entries of the goal, named goal_..., got {self.state}")
 
     @property
     def dt(self) -> float:

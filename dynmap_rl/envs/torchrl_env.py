@@ -194,7 +194,9 @@ class DynmapBatchedEnv(EnvBase):
             data["state"] = _stack((task.state(w) for w in worlds), len(worlds))
             data["dynamics"] = self._read_dynamics(worlds)
         if self.draw:
-            frames = np.stack([self.draw(w) for w in worlds])
+            frames = np.stack(
+                [np.array(self.draw(w)) for w in worlds]
+            )  # copies: a renderer may use one array
             data["pixels"] = torch.from_numpy(frames).permute(0, 3, 1, 2)
         return TensorDict(data, batch_size=[len(worlds)], device=self.device)
 

@@ -72,12 +72,18 @@ def policy_errors(policy: nn.Module, features: TensorDictBase) -> dict[str, floa
 
     Returns:
         ``imitation_l1``, the paper's loss in normalised units, and the mean absolute error of every entry of the action
-        in the dataset's units, ``error_action_0`` and so on.
+        in the dataset's units, ``error_action_0`` and so on; both without disturbed steps.
     """
     features = features.to(next(policy.parameters()).device)
     predicted = policy(*(features[key] for key in (*STATES, "goal")))
     loss = imitation_loss(predicted, features["action"], policy.action, features["disturbed"])
-    entries = (predicted - features["action"]).abs().mean((0, 1)).tolist()
+    entries = (
+        (predicted - features["action"])
+        .abs()
+        .where(~features["disturbed"], torch.nan)
+        .nanmean((0, 1))
+        .tolist()
+    )
     return {"imitation_l1": loss.item()} | {f"error_action_{i}": e for i, e in enumerate(entries)}
 
 

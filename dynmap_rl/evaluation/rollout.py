@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 
@@ -143,7 +144,7 @@ def episode_rows(episodes: TensorDict, seeds: list[int]) -> list[dict]:
         ``position_error`` (m) and ``success``. If the world model decodes positions of all bodies,
         ``localization_error`` is the mean distance between predicted and true position of the first body, the cart or
         the object of a MuJoCo task (m), and ``localization_error_away`` its mean over the steps more than 0.1 m from the
-        goal.
+        goal, where there are any.
     """
     last = episodes["next"][:, -1]
     rows = [
@@ -162,10 +163,11 @@ def episode_rows(episodes: TensorDict, seeds: list[int]) -> list[dict]:
         axes = episodes["goal"].shape[-1]  # the goal is a point in the plane or in space
         error = error[:, 1:, :axes].norm(dim=-1)  # [E, T - 1]
         away = (truth[..., :axes] - episodes["goal"])[:, 1:].norm(dim=-1) > 0.1
-        away_error = (error * away).sum(1) / away.sum(1).clamp(min=1)
+        away_error = (error * away).sum(1) / away.sum(1)
         for row, value, value_away in zip(rows, error.mean(1).tolist(), away_error.tolist(), strict=True):
             row["localization_error"] = round(value, 5)
-            row["localization_error_away"] = round(value_away, 5)
+            if math.isfinite(value_away):
+                row["localization_error_away"] = round(value_away, 5)
     return rows
 
 

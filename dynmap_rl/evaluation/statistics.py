@@ -40,9 +40,10 @@ def summarize(rows: list[dict]) -> dict:
     }
     if "touched" in rows[0]:
         summary["touched"] = 100 * sum(row["touched"] for row in rows) / count
-    if "localization_error" in rows[0]:
-        summary["localization"] = 1000 * float(np.mean([row["localization_error"] for row in rows]))
-        summary["localization_away"] = 1000 * float(np.mean([row["localization_error_away"] for row in rows]))
+    for name in ("localization", "localization_away"):
+        key = name.replace("localization", "localization_error")
+        if errors := [row[key] for row in rows if key in row]:
+            summary[name] = 1000 * float(np.mean(errors))
     if causes := Counter(row["cause"] for row in rows if "cause" in row):
         summary["causes"] = dict(causes.most_common())
     return summary

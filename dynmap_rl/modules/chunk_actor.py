@@ -44,11 +44,12 @@ class ChunkActor:
         Args:
             pixels: frames uint8 ``[B, 3, S, cameras * S]``.
             goal: goals ``[B, G]`` (SI units).
-            step: number of the step before which the frames were taken, from 0. A step before that of the last call
-                begins a new episode, as does :meth:`reset`. By default, the whole last chunk has been executed since the last frame.
+            step: number of the step before which the frames were taken, from 0. Step 0, and a step before that of the
+                last call, begin a new episode, as does :meth:`reset`. By default, the whole last chunk has been
+                executed since the last frame.
         """
         step = max(self.steps, default=-1) + 1 if step is None else step
-        if step < self.first:
+        if step == 0 or step < self.first:
             self.reset()
         # Where a robot has waited for a chunk, its step may lie beyond the last chunk.
         before = min(step - 1, max(self.steps, default=-1))

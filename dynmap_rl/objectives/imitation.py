@@ -25,6 +25,7 @@ def imitation_loss(
     ignore: torch.Tensor | None = None,
     emphasis: float = 0.0,
     total: Callable[[torch.Tensor], torch.Tensor] = lambda weight: weight,
+    within: torch.Tensor | None = None,
 ) -> torch.Tensor:
     """Return the mean absolute difference of two actions in normalised units, a scalar.
 
@@ -35,9 +36,10 @@ def imitation_loss(
         ignore: bool ``[B, T, 1]``, steps to leave out because the demonstrator did not act.
         emphasis: every step is weighted by ``1 + emphasis * |a_t - a_{t-1}|`` (normalised, ``a_{-1} = 0``). The world
             model's memory holds the last action, and copying it has a low loss in most steps; the weight stresses
-            the steps in which the expert changes its action (keyframe-focused imitation, Wen et al. 2021). The step
-            after an ignored one has the weight 1. 0 is the paper's loss.
+            the steps in which the expert changes its action (keyframe-focused imitation, Wen et al. 2021). A step
+            whose last action is not known has the weight 1. 0 is the paper's loss.
         total: function of the sum of the weights, by whose result the loss is divided.
+        within: bool ``[B, 1, 1]``, windows that begin within an episode, whose last action is not known.
     """
     error = ((predicted - action) / normalizer.scale).abs().mean(-1, keepdim=True)
     weight = torch.ones_like(error)
@@ -46,6 +48,8 @@ def imitation_loss(
         change = ((action - before) / normalizer.scale).abs().mean(-1, keepdim=True)
         if ignore is not None:
             change = torch.where(F.pad(ignore[:, :-1], (0, 0, 1, 0)), 0.0, change)
+        if within is not None:
+            change[:, :1] = torch.where(within, 0.0, change[:, :1])
         weight = weight + emphasis * change
     if ignore is not None:  # not by a product, since ignored entries may be NaN
         error, weight = (torch.where(ignore, 0.0, x) for x in (error, weight))
@@ -79,13 +83,19 @@ def find_target(
     return target, ignore
 
 
+def begins_within(tensordict: TensorDictBase, step_count: NestedKey = "step_count") -> torch.Tensor | None:
+    """Return which windows ``[B, T]`` begin after the first step of their episode, bool ``[B, 1, 1]``, if it is known."""
+    steps = tensordict.get(step_count, None)
+    return None if steps is None else steps.reshape(*tensordict.shape, 1)[:, :1] > 0
+
+
 class ImitationLoss(LossModule):
     """L1 loss of a policy on latents and hidden states (paper, Sec. III-B); see :func:`imitation_loss`.
 
     Input ``[B, T]``: ``latent``, ``hidden1``, ``hidden2``, ``goal`` and the demonstrator's ``action`` (SI units).
     Optional: ``expert_action`` to imitate in the place of ``action``, or ``disturbed`` bool ``[B, T, 1]``, the steps to
-    leave out (see :func:`find_target`), and a mask of valid steps as in
-    :class:`dynmap_rl.objectives.WorldModelLoss`.
+    leave out (see :func:`find_target`), a mask of valid steps as in :class:`dynmap_rl.objectives.WorldModelLoss`, and
+    ``step_count`` int ``[B, T, 1]``, the number of the step in its episode; without it, windows begin their episodes.
 
     Output: ``loss_policy``, a scalar.
 
@@ -107,6 +117,7 @@ class ImitationLoss(LossModule):
         action: NestedKey = "action"
         expert_action: NestedKey = "expert_action"
         disturbed: NestedKey = "disturbed"
+        step_count: NestedKey = "step_count"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -136,5 +147,8 @@ class ImitationLoss(LossModule):
         states = (tensordict[key] for key in self.in_keys[:-1])
         masks = self._loss_mask_keys()
         target, ignore = find_target(tensordict, keys.action, keys.expert_action, keys.disturbed, masks)
-        loss = imitation_loss(self.policy(*states), target, self.policy.action, ignore, self.emphasis)
+        loss = imitation_loss(
+            self.policy(*states), target, self.policy.action, ignore, self.emphasis,
+            within=begins_within(tensordict, keys.step_count),
+        )  # fmt: skip
         return TensorDict({"loss_policy": loss}, [])

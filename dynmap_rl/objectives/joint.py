@@ -13,7 +13,7 @@ from torchrl.objectives.common import LossModule
 from dynmap_rl.modules.policy import FeedforwardPolicy, RecurrentPolicy
 from dynmap_rl.utils.ranks import mean_over_ranks
 
-from .imitation import find_target, imitation_loss
+from .imitation import begins_within, find_target, imitation_loss
 from .windows import check_windows
 from .world_model import WorldModelLoss
 
@@ -25,7 +25,8 @@ class JointLoss(LossModule):
 
     Input: the input of :class:`WorldModelLoss` and ``goal`` ``[B, T, G]``. Optional: ``expert_action``
     to imitate in the place of ``action``, or ``disturbed`` bool ``[B, T, 1]``, the steps that the policy's loss leaves
-    out (see :func:`find_target`), as it leaves out steps that a mask marks as invalid.
+    out (see :func:`find_target`), as it leaves out steps that a mask marks as invalid, and ``step_count`` (see
+    :class:`ImitationLoss`).
 
     Output: ``loss_policy`` (times ``beta_joint``) and, except for end-to-end training, the world model's losses.
 
@@ -50,6 +51,7 @@ class JointLoss(LossModule):
         goal: NestedKey = "goal"
         expert_action: NestedKey = "expert_action"
         disturbed: NestedKey = "disturbed"
+        step_count: NestedKey = "step_count"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -72,7 +74,7 @@ class JointLoss(LossModule):
     def set_keys(self, **kwargs) -> None:
         """Set keys of this loss and of the world model's loss."""
         super().set_keys(**kwargs)
-        own = ("goal", "expert_action", "disturbed")
+        own = ("goal", "expert_action", "disturbed", "step_count")
         self.world_model_loss.set_keys(**{k: v for k, v in kwargs.items() if k not in own})
 
     @property
@@ -106,5 +108,6 @@ class JointLoss(LossModule):
         target, ignore = find_target(tensordict, keys.action, keys.expert_action, keys.disturbed, masks)
         # Divided by the same number in all processes, so that the mean of their losses is the loss of the whole batch.
         total = mean_over_ranks if torch.is_grad_enabled() else (lambda weight: weight)
-        loss = imitation_loss(predicted, target, self.policy.action, ignore, self.emphasis, total)
+        within = begins_within(tensordict, keys.step_count)
+        loss = imitation_loss(predicted, target, self.policy.action, ignore, self.emphasis, total, within)
         return TensorDict({**losses, "loss_policy": self.beta_joint * loss}, [])

@@ -12,7 +12,7 @@ from torchrl.objectives.common import LossModule
 
 from dynmap_rl.modules.layers import color_weights
 from dynmap_rl.modules.world_model import WorldModel
-from dynmap_rl.utils.ranks import mean_over_ranks, ranks
+from dynmap_rl.utils.ranks import mean_over_ranks, rank, ranks
 
 from .windows import check_windows
 
@@ -102,7 +102,8 @@ class WorldModelLoss(LossModule):
         check_windows(tensordict, steps=2)
         latent, states = self.predict(tensordict)
         read = latent
-        if blind := round(self.imagined * len(latent)):
+        # Of the windows of all processes, of which each has every N-th.
+        if blind := len(range(rank(), round(self.imagined * len(latent) * ranks()), ranks())):
             read, states = self._imagine(tensordict, latent, states, blind)
         return TensorDict(self.compare(tensordict, latent, states, read), [])
 

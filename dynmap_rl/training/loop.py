@@ -69,7 +69,8 @@ def fit(
     model.to(memory_format=torch.channels_last)  # with bfloat16 six times faster on a CPU
     optimizer = make_optimizer(model, settings.learning_rate, weight_decay=1e-4)
     episodes = episodes.select(
-        "pixels", "action", "goal", "dynamics", "disturbed", "expert_action", "labelled", strict=False
+        *("pixels", "action", "goal", "dynamics", "disturbed", "expert_action", "labelled", "step_count"),
+        strict=False,
     )
     if device.type == "cuda" and episodes.bytes() < torch.cuda.mem_get_info(device)[0] / 2:
         episodes = episodes.to(device)  # larger ones stay on disk

@@ -19,6 +19,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 from tqdm import tqdm
 
+from dynmap_rl.envs.world import EPISODE_STEPS
 from dynmap_rl.experts.network import ExpertNetwork, make_actor
 from dynmap_rl.runs.folder import load_training_state, save_training_state, truncate_metrics
 from dynmap_rl.runs.loggers import log_metrics
@@ -77,7 +78,12 @@ def train_ppo(
         MLP(inputs, 1, num_cells=[width, width], activation_class=torch.nn.Tanh), in_keys=["state"]
     )
     advantage = GAE(
-        gamma=settings.gamma, lmbda=settings.gae_lambda, value_network=critic, average_gae=True, shifted=True
+        gamma=settings.gamma,
+        lmbda=settings.gae_lambda,
+        value_network=critic,
+        average_gae=True,
+        shifted=settings.steps
+        <= EPISODE_STEPS,  # one pass of the critic, where no episode ends within a rollout
     )
     policy_loss = ClipPPOLoss(
         actor,

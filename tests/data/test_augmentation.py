@@ -1,5 +1,7 @@
 """Augmentations are symmetries of the scene."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -95,6 +97,16 @@ def test_a_point_and_a_single_body_change_like_the_first_of_two_bodies(size):
     for quantity, values in out["dynamics"].items():
         assert torch.equal(values, expected["dynamics", quantity][..., :size])
     assert not torch.equal(out["dynamics", "position"], few["dynamics", "position"])
+
+
+def test_frames_of_several_cameras_change_their_colours_alone():
+    episodes = make_episodes()
+    episodes["pixels"] = torch.cat([episodes["pixels"]] * 2, -1)
+    out = augment(episodes, torch.Generator().manual_seed(1), replace(Augmentation.off(), recolor=True))[
+        "pixels"
+    ]
+    assert torch.equal(out[..., :64], out[..., 64:]) and not torch.equal(out, episodes["pixels"])
+    assert torch.equal(out.sum(2), episodes["pixels"].sum(2))
 
 
 def test_windows_of_other_sizes_cannot_be_moved():

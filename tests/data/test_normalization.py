@@ -57,3 +57,13 @@ def test_ranges_in_space_are_shared_by_x_y_and_z_and_not_too_narrow():
     assert found["goal"]["low"] == pytest.approx([-0.05] * 3)
     velocity.zero_()
     assert layout_constants(episodes, layout)["velocity"]["high"] == pytest.approx([0.1] * 3 + [1.0] * 3)
+
+
+def test_entries_that_do_not_come_in_threes_have_ranges_of_their_own():
+    layout = SimpleNamespace(action_limit=(1.0,), state=("goal_x", "goal_y"), goal_size=2)
+    layout.dynamics = {"position": ("a_x", "a_y")}
+    values = torch.stack([torch.linspace(0, 1, 2001), torch.linspace(0, 9, 2001)], -1)[None]
+    found = layout_constants(
+        TensorDict({"goal": values, "dynamics": {"position": values}}, [1, 2001]), layout
+    )
+    assert found["goal"]["high"] == found["position"]["high"] == pytest.approx([1.0, 9.0], rel=0.01)

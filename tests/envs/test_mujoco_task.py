@@ -94,6 +94,22 @@ def test_a_recording_does_not_depend_on_those_before(own_task):  # noqa: F811
     check_recordings(own_task)
 
 
+def test_a_recording_copies_what_a_task_may_write_over(own_task, monkeypatch):  # noqa: F811
+    expected, kind = demonstrate(own_task, [3]), type(get_task(own_task))
+    draw, look = kind._draw, kind.agent_pos
+    picture, state = np.zeros((64, 64, 3), np.uint8), np.zeros(6, np.float32)
+
+    def write(array: np.ndarray, values: np.ndarray) -> np.ndarray:
+        array[:] = values
+        return array
+
+    monkeypatch.setattr(kind, "_draw", lambda self, world: write(picture, draw(self, world)))
+    monkeypatch.setattr(kind, "agent_pos", lambda self, world: write(state, look(self, world)))
+    demonstrators._open_simulator.cache_clear()
+    assert (demonstrate(own_task, [3]) == expected).all()
+    demonstrators._open_simulator.cache_clear()
+
+
 def test_arguments_are_a_part_of_the_name(own_task):  # noqa: F811
     task = get_task(f"{own_task}:image_size=96,cameras=2")
     assert task.name == "push_image_size_96_cameras_2" and get_task(own_task).name == "push"
@@ -312,3 +328,10 @@ def test_the_benchmarks_repeat_bit_by_bit(name):
     _, last = roll(f"mujoco:{name}", [12])
     assert (both[1:] == last).all()
     check_recordings(f"mujoco:{name}")
+
+
+def test_the_goal_stands_last_in_the_state():
+    layout = get_task("balance_reaching").layout
+    for state in (("cart_x",), ("goal_x", "cart_x")):
+        with pytest.raises(ValueError, match="must end with the entries of the goal"):
+            replace(layout, state=state)

@@ -115,6 +115,20 @@ def test_number_of_worlds_does_not_matter(task):
         assert (play(alone, [i], actions[i : i + 1])[0] == together[i]).all()
 
 
+def test_a_renderer_may_draw_into_one_array(monkeypatch):
+    seeds, actions = range(3), random_actions(3, 2)
+    expected = play(DynmapBatchedEnv(num_envs=3, from_pixels=True), seeds, actions)["pixels"]
+    draw, picture = TASKS["balance_reaching"].make_renderer(), np.zeros((64, 64, 3), np.uint8)
+
+    def draw_into(world) -> np.ndarray:
+        picture[:] = draw(world)
+        return picture
+
+    env = DynmapBatchedEnv(num_envs=3, from_pixels=True)
+    env.draw = draw_into
+    assert torch.equal(play(env, seeds, actions)["pixels"], expected)
+
+
 @every_task
 def test_partial_reset_touches_only_the_masked_worlds(task):
     env = DynmapBatchedEnv(task, num_envs=3, seed=0)

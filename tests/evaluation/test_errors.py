@@ -74,6 +74,7 @@ def test_policy_errors_leave_disturbed_steps_out_of_the_loss(episodes):
     assert found["error_action_2"] == pytest.approx(error[..., 2].mean().item())
     features["disturbed"][:, 0] = True
     rest = policy_errors(policy, features)["imitation_l1"]
+    assert policy_errors(policy, features)["error_action_2"] == pytest.approx(error[:, 1:, 2].mean().item())
     assert rest == pytest.approx((error / 0.02)[:, 1:].mul(torch.tensor([1, 1, 0.4])).mean().item(), rel=1e-4)
 
 

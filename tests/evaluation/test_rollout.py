@@ -137,6 +137,10 @@ def test_errors_of_the_predicted_position_by_hand():
     [row] = episode_rows(TensorDict(data, [1, 4]), [7])
     assert row["localization_error"] == pytest.approx(0.02)
     assert row["localization_error_away"] == pytest.approx(0.015)
+    position[:] = 0
+    assert "localization_error_away" not in episode_rows(TensorDict(data, [1, 4]), [7])[0], (
+        "always near the goal"
+    )
 
 
 @torch.no_grad()

@@ -44,6 +44,8 @@ def test_every_entry_of_a_summary_is_that_of_its_own_column():
     assert (found["DR_interval"], found["SR_interval"]) == (wilson(1, 4), wilson(3, 4))
     assert (found["localization"], found["localization_away"]) == pytest.approx((10.0, 20.0))
     assert list(found["causes"].items()) == [("a", 2), ("b", 1), ("c", 1)]
+    del made[0]["localization_error_away"]  # an episode that is always near the goal
+    assert summarize(made)["localization_away"] == pytest.approx(20.0)
 
 
 def test_students_interval_is_that_of_scipy_within_0_and_100():

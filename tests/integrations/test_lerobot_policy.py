@@ -54,11 +54,20 @@ def test_windows_are_those_of_our_own_loader(recording):
         (2, 1, [117, 118, 119, 119, 119, 119]),
     ):
         expected = episodes[episode][list(steps)]
-        for key in ("pixels", "action", "expert_action", "goal", "dynamics"):
+        for key in ("pixels", "action", "expert_action", "goal", "dynamics", "step_count"):
             assert (windows[row][key] == expected[key]).all(), key
         assert torch.equal(windows["disturbed"][row], expected["disturbed"])
         there = [row != 2 or step < 3 for step in range(6)]
         assert windows["collector", "mask"][row].tolist() == there
+
+
+def test_what_was_not_found_in_the_frames_is_not_labelled(recording, tmp_path):
+    root = tmp_path / "tracks"
+    add_dynamics(recording, root, source="tracks", replace=True)
+    policy, episodes = new_policy(root), load_dataset(root)
+    windows = policy.make_windows(load_windows(root, policy, [0, 125]))
+    for row, expected in enumerate((episodes[0, :6], episodes[1, 5:11])):
+        assert torch.equal(windows["labelled"][row], expected["labelled"])
 
 
 def test_a_part_from_the_middle_has_its_own_dynamics(recording, tmp_path):

@@ -95,6 +95,7 @@ def test_an_earlier_step_begins_a_new_episode():
         chunks.act(pixels[0], goal, step=step)
     first = fresh.act(pixels[1], goal, step=0)  # its frame is another than in the episode before
     assert torch.equal(chunks.act(pixels[1], goal, step=0), first)
+    assert torch.equal(fresh.act(pixels[1], goal, step=0), first), "after an episode of a single call, too"
     # A robot that waited longer than a chunk goes on with its memory.
     assert not torch.allclose(chunks.act(pixels[1], goal, step=9), first)
 

@@ -28,6 +28,26 @@ def test_emphasis_weighs_the_steps_in_which_the_action_changes():
     assert from_the_start[0] == from_the_start[1] > from_the_start[2]
 
 
+def test_the_first_step_of_a_window_within_an_episode_has_no_emphasis():
+    torch.manual_seed(0)
+    model = make_model()
+    policy = make_policy(CONSTANTS, "feedforward", model, width=8)
+    states = {
+        "latent": torch.randn(2, 3, 16),
+        "hidden1": torch.randn(2, 3, 24),
+        "hidden2": torch.randn(2, 3, 24),
+    }
+    td = TensorDict(states | {"goal": torch.rand(2, 3, 2), "action": torch.full((2, 3, 3), 0.01)}, [2, 3])
+    loss = ImitationLoss(policy, emphasis=4.0)
+    begins = loss(td)["loss_policy"]
+    td["step_count"] = torch.tensor([[[0], [1], [2]]] * 2)
+    assert torch.equal(loss(td)["loss_policy"], begins)
+    td["step_count"] += 5
+    assert torch.allclose(loss(td)["loss_policy"], ImitationLoss(policy)(td)["loss_policy"]), (
+        "it never changes"
+    )
+
+
 def test_the_loss_is_divided_by_the_given_total():
     action, normalizer = torch.zeros(1, 4, 1), Normalizer([-1.0], [1.0])
     loss = imitation_loss(action + 1, action, normalizer, total=lambda weight: 2 * weight)

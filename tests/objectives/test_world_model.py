@@ -7,6 +7,7 @@ from tensordict import TensorDict
 
 from dynmap_rl.keys import DYNAMICS
 from dynmap_rl.modules.checkpoints import make_world_model
+from dynmap_rl.objectives import world_model as objectives
 from dynmap_rl.objectives.world_model import WorldModelLoss, rms
 
 CONSTANTS = CONSTANTS | {q: {"low": [-2.0] * 6, "high": [2.0] * 6} for q in DYNAMICS}
@@ -195,6 +196,22 @@ def test_only_the_first_windows_are_imagined_and_from_any_step_on(monkeypatch):
     for _ in range(40):
         assert loss(td)["loss_position"].item() == pytest.approx(seen, rel=1e-4)
     assert contexts == {1, 2, 3, 4, 5}
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 6, 12])
+def test_as_many_windows_are_imagined_in_any_number_of_processes(monkeypatch, count):
+    model, loss = make(("position",), imagined=0.5)
+    td, imagined = batch(b=12 // count), []
+    imagine = model.transition.imagine
+    monkeypatch.setattr(
+        model.transition, "imagine", lambda z, action, n: imagined.append(len(z)) or imagine(z, action, n)
+    )
+    monkeypatch.setattr(objectives, "ranks", lambda: count)
+    with torch.no_grad():
+        for rank in range(count):
+            monkeypatch.setattr(objectives, "rank", lambda rank=rank: rank)
+            loss(td)
+    assert sum(imagined) == 6
 
 
 def test_the_latent_loss_of_imagined_windows_moves_the_predicted_change_alone():

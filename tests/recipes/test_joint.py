@@ -1,12 +1,14 @@
 """Joint and end-to-end training as commands."""
 
+import shutil
+
 import pytest
 from commands import place_recordings, run, run_small
 from small import read_weights
 
 from dynmap_rl.modules.policy import FeedforwardPolicy
 from dynmap_rl.runs.lookup import load_actor
-from dynmap_rl.utils.files import read_json
+from dynmap_rl.utils.files import read_json, write_json
 
 
 @pytest.fixture
@@ -35,6 +37,19 @@ def test_a_run_has_results_and_is_not_repeated(place, recipe, name, row, paper):
     before = read_weights(folder)
     assert "complete" in run_small(place, recipe).stdout
     assert read_weights(folder) == before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("recipe", ["joint", "end_to_end"])
+def test_a_dataset_without_held_out_episodes_is_divided(recordings, tmp_path, recipe):
+    """LeRobot's tools leave one split, and drop our metadata."""
+    shutil.copytree(recordings("balance_reaching"), tmp_path / "edited")
+    info = tmp_path / "edited/meta/info.json"
+    content = read_json(info)
+    write_json(info, content | {"splits": {"train": f"0:{content['total_episodes']}"}})
+    (info.parent / "dynmap.json").unlink()
+    run_small(tmp_path, recipe, "--dataset", "edited", "--run", "run")
+    assert (tmp_path / "run/eval.json").exists()
 
 
 @pytest.mark.slow

@@ -77,8 +77,12 @@ def _demonstrate(
     if not callable(expert):
         raise ValueError(f"the demonstrator of {rules.name} must return a function, got {expert!r}")
     for t in range(layout.steps):
-        agent_pos = np.asarray(rules.agent_pos(world), np.float32)
-        row = {"pixels": draw(world), "agent_pos": agent_pos, "goal": agent_pos[-layout.goal_size :]}
+        agent_pos = np.array(rules.agent_pos(world), np.float32)  # copies: a task may write into one array
+        row = {
+            "pixels": np.array(draw(world)),
+            "agent_pos": agent_pos,
+            "goal": agent_pos[-layout.goal_size :],
+        }
         row |= {f"dynamics.{name}": getattr(world, name).astype(np.float32) for name in DYNAMICS}
         try:
             action = np.asarray(expert(), np.float32)

@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from dynmap_rl.data.demonstrations import find_meta
 from dynmap_rl.data.format.reading import read_column, read_file, read_info
 from dynmap_rl.envs.tasks import get_task
-from dynmap_rl.keys import NEEDED
+from dynmap_rl.keys import FOUND, NEEDED
 
 from .configuration_dynmap import GOAL
 
@@ -29,8 +29,9 @@ def read_columns(root: str | Path) -> TensorDict:
     Returns:
         ``[N]``, the frames on this machine: ``index`` ``[N]``, LeRobot's number of the frame, which increases;
         ``action`` ``[N, 3]``, ``goal`` ``[N, 2]``, ``("dynamics", "position" | "velocity" | "acceleration")``
-        ``[N, 6]`` in SI units, ``disturbed`` bool ``[N, 1]``, the steps in which a push acted; false without such a
-        column, and ``expert_action`` ``[N, 3]``, where the dataset has it.
+        ``[N, 6]`` in SI units, ``step_count`` ``[N, 1]``, the number of the step in its episode, ``disturbed`` bool
+        ``[N, 1]``, the steps in which a push acted; false without such a column, and, where the dataset has them,
+        ``expert_action`` ``[N, 3]`` and ``labelled`` bool ``[N, 6]``, what was found in the frames.
 
     Raises:
         ValueError: columns are missing, numbers are not finite, or the files are not on this machine.
@@ -48,9 +49,9 @@ def read_columns(root: str | Path) -> TensorDict:
             f"{root} must have the columns {', '.join(sorted(missing))}; record a dataset with recipes/collect.py"
         )
     columns |= {name: name for name in (DISTURBED, EXPERT_ACTION) if name in info["features"]}
-    table = pa.concat_tables([read_file(file, ["index", *columns.values()]) for file in files]).sort_by(
-        "index"
-    )
+    columns |= {"labelled": FOUND} if FOUND in info["features"] else {}
+    names = ["index", "frame_index", *columns.values()]
+    table = pa.concat_tables([read_file(file, names) for file in files]).sort_by("index")
     index = table["index"].to_numpy()
     if not (np.diff(index) > 0).all():
         raise ValueError(
@@ -59,6 +60,7 @@ def read_columns(root: str | Path) -> TensorDict:
     data = {key: read_column(root, info, table, name) for key, name in columns.items()}
     data["goal"] = data.pop("agent_pos")[:, -GOAL:]
     data["index"] = torch.tensor(index)
+    data["step_count"] = torch.tensor(table["frame_index"].to_numpy())[:, None]
     data[DISTURBED] = data.get(DISTURBED, torch.zeros(len(table), 1)).bool()
     return TensorDict(data, [len(table)])
 

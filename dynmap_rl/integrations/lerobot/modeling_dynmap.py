@@ -28,6 +28,8 @@ from dynmap_rl.objectives.world_model import WorldModelLoss
 from .columns import is_symmetric, read_columns
 from .configuration_dynmap import GOAL, DynmapConfig
 
+OPTIONAL = "expert_action", "labelled"  # columns that a dataset may lack
+
 
 class DynmapPolicy(PreTrainedPolicy):
     """World model, and the policy that acts on its states.
@@ -72,7 +74,7 @@ class DynmapPolicy(PreTrainedPolicy):
             config.task = task or config.task
             config.source = {"task": config.task, "training": "joint"} if config.task else None
             # Buffers, to be on the model's device, but no part of a checkpoint.
-            for name in ("index", "disturbed", "expert_action"):
+            for name in ("index", "step_count", "disturbed", *OPTIONAL):
                 self.register_buffer(name, columns.get(name, None), persistent=False)
             for name in DYNAMICS:
                 self.register_buffer(name, columns["dynamics", name], persistent=False)
@@ -116,8 +118,8 @@ class DynmapPolicy(PreTrainedPolicy):
         """Convert a batch of LeRobot's loader to the input of the losses.
 
         Returns:
-            ``[B, T]`` with ``pixels``, ``action``, ``goal``, ``dynamics``, ``disturbed``, ``expert_action`` where
-            the dataset has it, and a mask that is false beyond the end of an episode.
+            ``[B, T]`` with ``pixels``, ``action``, ``goal``, ``dynamics``, ``disturbed``, ``step_count``, where the
+            dataset has them ``expert_action`` and ``labelled``, and a mask that is false beyond the end of an episode.
 
         Raises:
             ValueError: the policy was made without a dataset.
@@ -137,10 +139,10 @@ class DynmapPolicy(PreTrainedPolicy):
             "goal": batch[OBS_STATE][..., -GOAL:],
             "dynamics": {name: getattr(self, name)[rows] for name in DYNAMICS},
             "disturbed": self.disturbed[rows],
+            "step_count": self.step_count[rows],
             ("collector", "mask"): ~beyond,
         }
-        if self.expert_action is not None:
-            data["expert_action"] = self.expert_action[rows]
+        data |= {name: getattr(self, name)[rows] for name in OPTIONAL if getattr(self, name) is not None}
         return TensorDict(data, action.shape[:2], device=action.device)
 
     def _augment(self, windows: TensorDict) -> TensorDict:
