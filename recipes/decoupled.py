@@ -111,10 +111,13 @@ def main(config: Config) -> None:
         world_model, episodes, constants, folder, config.policy,
         judge=judge, task=config.task, seeds=seeds, compute=config.compute, logger=config.logger,
     )  # fmt: skip
+    settings = plain_settings(config)
+    if config.pretrained:  # its other settings are those of its own run
+        settings["world_model"] = {"supervision": config.world_model.supervision}
     result = write_report(
         folder, world_model, episodes["eval"], seeds,
         task=config.task, dataset=dataset, policy=config.policy.kind, origin=origin,
-        settings=plain_settings(config), command=command_line(sys.argv), frozen=fingerprint, compare=paper_numbers,
+        settings=settings, command=command_line(sys.argv), frozen=fingerprint, compare=paper_numbers,
     )  # fmt: skip
     print(f"\n{row_text(result, paper_numbers(result))}\nwritten: {folder}")
 

@@ -97,7 +97,7 @@ def list_runs() -> list[Run]:
     runs = [*_decoupled(0), *main, *_transfer(main, 0)]
     for seed in SEEDS[1:]:
         runs += [*_decoupled(seed), *_transfer(main, seed)]
-    runs += [run for seed in SEEDS for s in SUPERVISIONS[:5] for run in _plain(s, seed)]
+    runs += [*(run for seed in SEEDS for s in SUPERVISIONS for run in _plain(s, seed)), _plain_end_to_end()]
     runs += [_ablate(row, seed, task) for seed in SEEDS for task in TASKS[:2] for row in ABLATIONS]
     return runs + other + [run for seed in SEEDS for run in _transfer(other, seed)]
 
@@ -172,6 +172,18 @@ def _plain(supervision: str, seed: int) -> list[Run]:
         table="extra",
     )
     return [run, _reuse(run)]
+
+
+def _plain_end_to_end() -> Run:
+    run = _end_to_end()
+    *column, row = run.cell
+    return replace(
+        run,
+        name=run.name.replace("end_to_end", "plain_end_to_end"),
+        cell=(*column, f"{row}, plain CNN"),
+        arguments=("--world_model.architecture", "plain"),
+        table="extra",
+    )
 
 
 def _ablate(row: str, seed: int, task: str) -> Run:

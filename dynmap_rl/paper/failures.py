@@ -71,7 +71,7 @@ def plot_failures(failures: list[dict], path: Path) -> None:
         path: file to write.
     """
     figure, axis = plt.subplots(figsize=(10, 1.6 + 0.4 * len(failures)), layout="constrained")
-    names, left = [_title(one) for one in failures], [0.0] * len(failures)
+    names, left = [f"{_title(one)}, first policy" for one in failures], [0.0] * len(failures)
     colors = plt.get_cmap("tab20").colors
     for number, cause in enumerate(_causes(failures)):
         shares = [_share(one, cause) for one in failures]
@@ -80,7 +80,7 @@ def plot_failures(failures: list[dict], path: Path) -> None:
     axis.set_yticks(range(len(names)), names, fontsize=8)
     axis.invert_yaxis()
     axis.set_xlabel("failed episodes [%]", fontsize=9)
-    axis.set_xlim(0, max([*left, 1.0]))
+    axis.set_xlim(0, 1.05 * max([*left, 1.0]))
     if any(left):
         axis.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     save_figure(figure, path)

@@ -118,19 +118,17 @@ def plot_scenes(frames: torch.Tensor, path: Path, columns: int = 8, rows: int = 
     save_figure(figure, path)
 
 
-def read_losses(results: Iterable[dict], kind: str = "held_out") -> tuple[np.ndarray, np.ndarray]:
+def read_losses(results: Iterable[dict]) -> tuple[np.ndarray, np.ndarray]:
     """Read the policy losses of every seed of some results, at the optimiser steps that all of them have logged.
 
     Args:
         results: contents of ``eval.json``; those of a release without ``losses`` have no curves.
-        kind: ``held_out``, the plain L1 loss on held-out demonstrations, or ``training``, the training loss (with its
-            emphasis, on one batch).
 
     Returns:
-        The steps ``[S]`` and the losses ``[R, S]`` of all R seeds (normalised units).
+        The steps ``[S]`` and the plain L1 losses on held-out demonstrations ``[R, S]`` of all R seeds (normalised units).
     """
     curves = [
-        dict(zip(seed["losses"]["step"], seed["losses"][kind], strict=True))
+        dict(zip(seed["losses"]["step"], seed["losses"]["held_out"], strict=True))
         for result in results
         for seed in result["results"]
         if "losses" in seed
@@ -139,23 +137,26 @@ def read_losses(results: Iterable[dict], kind: str = "held_out") -> tuple[np.nda
     return np.array(steps), np.array([[curve[step] for step in steps] for curve in curves])
 
 
-def loss_panels(task: str) -> dict[str, dict[str, list[str]]]:
+def loss_panels(task: str, architecture: str = "glimpse") -> dict[str, dict[str, list[str]]]:
     """Return the panels of Fig. 7: title to label to names of cells.
 
     A panel compares one thing. All else is decoupled training of recurrent policies over all supervisions.
 
     Args:
         task: task of the cells.
+        architecture: form of the world models, ``glimpse`` or ``plain``, with which there is no joint training.
     """
+    plain = architecture == "plain"
     supervisions = [some for n in range(len(DYNAMICS) + 1) for some in combinations(DYNAMICS, n)]
 
-    def cells(training="decoupled", policy="recurrent", among=supervisions):
+    def cells(training="plain" if plain else "decoupled", policy="recurrent", among=supervisions):
         return [f"{task}_{training}_{'_'.join(s) or 'none'}_{policy}" for s in among]
 
-    end_to_end = [f"{task}_end_to_end_recurrent"]
+    joint = {} if plain else {"joint": cells("joint")}
+    end_to_end = [f"{task}{'_plain' if plain else ''}_end_to_end_recurrent"]
     panels = {
         "(a) dynamics supervision": {row_name(s): cells(among=[s]) for s in supervisions},
-        "(b) training approach": {"decoupled": cells(), "joint": cells("joint"), "end-to-end": end_to_end},
+        "(b) training approach": {"decoupled": cells(), **joint, "end-to-end": end_to_end},
         "(c) policy type": {"recurrent": cells(), "feedforward": cells(policy="feedforward")},
     }
     for letter, quantity in zip("def", DYNAMICS, strict=True):
@@ -183,9 +184,7 @@ def find_losses(panels: dict[str, dict[str, list[str]]], folder: Path) -> dict[s
     return results
 
 
-def plot_losses(
-    panels: dict[str, dict[str, list[str]]], results: Mapping[str, dict], path: Path, kind: str = "held_out"
-) -> None:
+def plot_losses(panels: dict[str, dict[str, list[str]]], results: Mapping[str, dict], path: Path) -> None:
     """Draw policy losses during training (paper, Fig. 7).
 
     A panel has a curve for each group of runs: the mean over the seeds of all its runs, with a band of one standard
@@ -195,22 +194,16 @@ def plot_losses(
         panels: see :func:`loss_panels`.
         results: contents of ``eval.json`` by the names of the runs.
         path: file to write.
-        kind: see :func:`read_losses`.
     """
     figure, axes = plt.subplots(3, 2, figsize=(11, 12), layout="constrained", sharey=True)
-    where = {
-        "held_out": "on held-out demonstrations (plain L1)",
-        "training": "in training (one batch, with emphasis)",
-    }
-    figure.suptitle(
-        f"Balance-Reaching, policy loss {where[kind]}: mean and std over runs and seeds", fontsize=11
-    )
+    title = "Balance-Reaching, policy loss on held-out demonstrations (plain L1): mean and std over runs and seeds"
+    figure.suptitle(title, fontsize=11)
     axes[0, 0].set_yscale("log")
     for axis, (title, groups) in zip(axes.flat, panels.items(), strict=True):
         axis.set_title(title, fontsize=10)
         for number, (label, names) in enumerate(groups.items()):
             done = [results[name] for name in names if name in results]
-            steps, losses = read_losses(done, kind)
+            steps, losses = read_losses(done)
             if not len(steps):
                 axis.plot([], [], f"C{number}", label=f"{label}: not run")
                 continue

@@ -137,7 +137,7 @@ def name_run(task: str, source: str, seed: int, policy: str, size: int = 300) ->
 def find_table_runs(tables: Path, architecture: str = "glimpse") -> dict[str, Path]:
     """Return results of runs of the paper's tables that are of this grid too, by the name of the run here.
 
-    These are runs of task 1 with the simulator's dynamics, and with none.
+    These are runs of task 1 with the simulator's dynamics, with none, and end to end.
 
     Args:
         tables: folder of the results of ``recipes/paper/tables.py``.
@@ -149,10 +149,14 @@ def find_table_runs(tables: Path, architecture: str = "glimpse") -> dict[str, Pa
             SOURCES[source].supervision.replace(",", "_"),
             f"_world_model_{seed}" if seed else "",
         )
-        path = tables / f"{TASKS[0]}_{training}_{supervision}_{policy}{suffix}.json"
-        if path.exists():
-            found[name_run(TASKS[0], source, seed, policy)] = path
-    return found
+        found[name_run(TASKS[0], source, seed, policy)] = (
+            tables / f"{TASKS[0]}_{training}_{supervision}_{policy}{suffix}.json"
+        )
+    form = "" if architecture == "glimpse" else f"_{architecture}"
+    found[name_run(TASKS[0], "end_to_end", 0, "recurrent")] = (
+        tables / f"{TASKS[0]}{form}_end_to_end_recurrent.json"
+    )
+    return {name: path for name, path in found.items() if path.exists()}
 
 
 def dataset_folder(task: str, source: str, datasets: Path, size: int = 300) -> Path:

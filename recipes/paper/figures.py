@@ -15,6 +15,7 @@ from pathlib import Path
 
 from dynmap_rl.paper.launch import find_missing
 from dynmap_rl.utils.cli import command_line, run_recipe
+from dynmap_rl.utils.settings import check_choice
 
 TASKS = {
     "balance_reaching": "Task 1: Balance-Reaching",
@@ -23,9 +24,10 @@ TASKS = {
 }
 ONE, _, THREE = TASKS
 WORLD_MODEL = f"{ONE}_decoupled_position_velocity_acceleration_recurrent"  # for Fig. 6 and 9
+FORMS = {"plain": "plain", "glimpse": "decoupled"}  # in names of runs
 POLICIES = {  # for Fig. 8
-    "(a) Only-RGB, feedforward policy": f"{ONE}_decoupled_none_feedforward",
-    "(b) RGB+[P+V], recurrent policy": f"{ONE}_decoupled_position_velocity_recurrent",
+    "(a) Only-RGB, feedforward policy": "none_feedforward",
+    "(b) RGB+[P+V], recurrent policy": "position_velocity_recurrent",
 }
 
 
@@ -37,6 +39,8 @@ class Config:
     runs: Path = Path("runs/tables")
     # Folder of the results of recipes/paper/tables.py, for fig7; by default those of the repository.
     results: Path = Path(__file__).parents[1] / "results/cells"
+    # Form of the world models of fig7 and fig8: plain, which is nearer to the paper's, or glimpse.
+    architecture: str = "plain"
     # Folder of the figures.
     output: Path = Path("runs/figures")
     # Names of figures, such as fig2,fig7; by default all.
@@ -50,6 +54,7 @@ def main(config: Config) -> None:
     from dynmap_rl.reporting.html import write_html
     from dynmap_rl.runs.folder import plain_settings
 
+    check_choice(config, "architecture", FORMS)
     names = [name.strip() for name in config.only.split(",")] if config.only else list(FIGURES)
     if unknown := sorted(set(names) - set(FIGURES)):
         raise ValueError(f"--only must be any of {', '.join(FIGURES)}, got {', '.join(unknown)}")
@@ -64,8 +69,8 @@ def main(config: Config) -> None:
     if drawn:
         captions = {f"{name}.png": caption for name, (_, caption) in FIGURES.items()}
         text = "\n".join([f"drawn: {', '.join(drawn)}", *missing])
-        settings = plain_settings(config)
-        write_html(config.output, "The paper's figures", text, command_line(sys.argv), settings, captions)
+        facts = text, command_line(sys.argv), plain_settings(config), captions
+        write_html(config.output, "The paper's figures", *facts)
     if missing:
         raise ValueError("; ".join(missing))
 
@@ -137,20 +142,17 @@ def draw_prediction(config: Config, datasets: dict, task: str, name: str) -> Non
 
     find_missing(config.runs, [WORLD_MODEL])
     world_model = load_world_model(config.runs / WORLD_MODEL / "world_model")
-    episodes = widest_ways(load_episodes(config, datasets, task), 2)
     title = f"World model of task 1 (RGB+[P+V+A]) on held-out episodes of {TASKS[task]}"
+    episodes = widest_ways(load_episodes(config, datasets, task), 2)
     plot_prediction(world_model, episodes, config.output / f"{name}.png", title)
 
 
 def draw_fig7(config: Config, datasets: dict) -> None:
-    """Draw the policies' losses, on held-out demonstrations and in training."""
+    """Draw the policies' losses on held-out demonstrations."""
     from dynmap_rl.paper.figures import find_losses, loss_panels, plot_losses
 
-    panels = loss_panels(ONE)
-    found = find_losses(panels, config.results)
-    plot_losses(panels, found, config.output / "fig7.png")
-    plot_losses(panels, found, config.output / "fig7_training.png", "training")
-    print(f"written: {config.output}/fig7_training.png")
+    panels = loss_panels(ONE, config.architecture)
+    plot_losses(panels, find_losses(panels, config.results), config.output / "fig7.png")
 
 
 def draw_fig8(config: Config, datasets: dict) -> None:
@@ -161,12 +163,10 @@ def draw_fig8(config: Config, datasets: dict) -> None:
     from dynmap_rl.paper.figures import plot_position_errors
     from dynmap_rl.runs.lookup import load_actor
 
-    missing, panels = find_missing(config.runs, list(POLICIES.values())), dict.fromkeys(POLICIES)
-    seeds = scene_seeds("test", 50, start=SHARED_STARTS)
-    for title, cell in POLICIES.items():
-        if cell not in missing:
-            panels[title] = roll_out(load_actor(config.runs / cell), ONE, seeds)
-    plot_position_errors(panels, config.output / "fig8.png")
+    cells = [f"{ONE}_{FORMS[config.architecture]}_{name}" for name in POLICIES.values()]
+    missing, seeds = find_missing(config.runs, cells), scene_seeds("test", 50, start=SHARED_STARTS)
+    episodes = [None if c in missing else roll_out(load_actor(config.runs / c), ONE, seeds) for c in cells]
+    plot_position_errors(dict(zip(POLICIES, episodes, strict=True)), config.output / "fig8.png")
 
 
 def draw_failures(config: Config, datasets: dict) -> None:

@@ -12,7 +12,7 @@ from dynmap_rl.modules.checkpoints import make_policy, make_world_model, save_po
 from dynmap_rl.paper.cells import list_runs
 from dynmap_rl.paper.figures import loss_panels
 from dynmap_rl.utils.files import read_json, write_json
-from recipes.paper.figures import POLICIES, WORLD_MODEL, Config, main
+from recipes.paper.figures import FORMS, POLICIES, WORLD_MODEL, Config, main
 
 
 def is_drawn(path) -> bool:
@@ -42,7 +42,7 @@ def runs(recording, tmp_path_factory):
     """A folder with the runs of Fig. 6, 8 and 9."""
     folder, constants = tmp_path_factory.mktemp("runs"), load_meta(recording)["normalization"]
     make_run(folder / WORLD_MODEL, constants, ("position", "velocity", "acceleration"), "recurrent")
-    without, with_dynamics = POLICIES.values()
+    without, with_dynamics = (f"balance_reaching_decoupled_{name}" for name in POLICIES.values())
     make_run(folder / without, constants, (), "feedforward")
     make_run(folder / with_dynamics, constants, ("position", "velocity"), "recurrent")
     return folder
@@ -59,11 +59,10 @@ def few_episodes(monkeypatch):
 @pytest.mark.slow
 def test_draws_every_figure(runs, recordings, few_episodes, tmp_path, capsys):
     datasets = ",".join(str(recordings(task)) for task in ("balance_reaching", "bin_dropping"))
-    main(Config(runs=runs, results=runs, output=tmp_path, datasets=datasets))
+    main(Config(runs=runs, results=runs, output=tmp_path, datasets=datasets, architecture="glimpse"))
     names = {
         "distributions",
         "failures",
-        "fig7_training",
         *(f"fig{number}" for number in (2, 3, 4, 6, 7, 8, 9)),
     }
     assert {path.stem for path in tmp_path.glob("*.png")} == names
@@ -101,7 +100,7 @@ def test_a_missing_run_is_named_after_the_other_figures(recording, tmp_path):
     assert f"fig6: runs/tables/{WORLD_MODEL} " in result.stderr
     command = "python recipes/paper/tables.py --results runs/results --only"
     assert f"{command} {WORLD_MODEL};" in result.stderr
-    assert f"{command} balance_reaching_decoupled_none_feedforward (1 more: without --only)" in result.stderr
+    assert f"{command} balance_reaching_plain_none_feedforward (1 more: without --only)" in result.stderr
     folder = tmp_path / "runs/figures"
     assert sorted(path.name for path in folder.iterdir()) == ["fig4.png", "report.html"]
     assert f"fig6: runs/tables/{WORLD_MODEL}" in (folder / "report.html").read_text()
@@ -124,10 +123,10 @@ def test_failures_of_the_runs_that_are_there_are_drawn(runs, tmp_path, capsys):
 @pytest.mark.slow
 def test_what_is_there_is_drawn(runs, few_episodes, tmp_path, capsys):
     part = tmp_path / "runs"
-    cell = POLICIES["(b) RGB+[P+V], recurrent policy"]
+    cell = f"balance_reaching_decoupled_{POLICIES['(b) RGB+[P+V], recurrent policy']}"
     part.mkdir()
     (part / cell).symlink_to(runs / cell)
-    main(Config(runs=part, results=runs, output=tmp_path, only="fig7,fig8"))
+    main(Config(runs=part, results=runs, output=tmp_path, only="fig7,fig8", architecture="glimpse"))
     assert is_drawn(tmp_path / "fig7.png") and is_drawn(tmp_path / "fig8.png")
     text = capsys.readouterr().out
     assert "3 of 25 results are there" in text and "1 of 2 runs are there" in text
@@ -143,5 +142,9 @@ def test_an_unknown_figure_gets_one_clear_line(tmp_path):
 
 def test_all_runs_are_cells_of_the_tables():
     cells = {run.name for run in list_runs()}
-    groups = [names for panel in loss_panels("balance_reaching").values() for names in panel.values()]
-    assert {WORLD_MODEL, *POLICIES.values(), *(name for names in groups for name in names)} <= cells
+    names = {WORLD_MODEL}
+    for form, word in FORMS.items():
+        names |= {f"balance_reaching_{word}_{name}" for name in POLICIES.values()}
+        for panel in loss_panels("balance_reaching", form).values():
+            names |= {name for group in panel.values() for name in group}
+    assert names <= cells
