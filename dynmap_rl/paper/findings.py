@@ -18,6 +18,7 @@ from .results import ROWS, Cell
 from .tables import join_table, p_text
 
 HOLDS, FAILED, OPEN = VERDICTS = "holds", "does not hold", "open"
+MIXED = "mixed"
 LEVEL = 0.05  # largest p of a verdict
 METRICS = {"SR": ("success", "%"), "DR": ("dropped", "%"), "PE": ("position_error", "mm")}
 
@@ -92,9 +93,15 @@ def _compare(pair: Pair, cells: Mapping[Key, Cell]) -> dict:
 
 
 def judge_claim(comparisons: list[dict]) -> str:
-    """Return the verdict on a claim: ``holds`` or ``does not hold`` if all of its comparisons say so, else ``open``."""
+    """Return the verdict on a claim.
+
+    ``holds`` if all of its comparisons hold; ``does not hold`` if some do not and none holds; ``mixed`` if some hold and
+    some do not; else ``open``.
+    """
     verdicts = {row["verdict"] for row in comparisons}
-    return verdicts.pop() if len(verdicts) == 1 else OPEN
+    if FAILED in verdicts:
+        return MIXED if HOLDS in verdicts else FAILED
+    return HOLDS if verdicts == {HOLDS} else OPEN
 
 
 def markdown_claims(comparisons: list[dict]) -> str:
@@ -108,13 +115,12 @@ def markdown_claims(comparisons: list[dict]) -> str:
     parts = dict.fromkeys((pair.claim, pair.group, pair.metric) for pair in pairs)
     for part in sorted(parts, key=lambda part: claims.index(part[0])):
         own = [row for row in comparisons if (row["claim"], row["group"], row["metric"]) == part]
-        paper = [pair.paper_gap for pair in pairs if (pair.claim, pair.group, pair.metric) == part]
         if not own:
             missing.setdefault(part[0], {})[part[1]] = None
             continue
         counts = [str(sum(row["verdict"] == verdict for row in own)) for verdict in VERDICTS]
         unit = METRICS[part[2]][1].replace("%", "points")
-        gaps = [_span(paper, 0), f"{_span([row['gap'] for row in own], 1)} {unit}"]
+        gaps = [_span([row["paper"] for row in own], 0), f"{_span([row['gap'] for row in own], 1)} {unit}"]
         lines.append([*part, *gaps, *counts, f"**{judge_claim(own)}**"])
     head = ["claim", "comparisons", "metric", "the paper's gaps", "gaps", *VERDICTS, "verdict"]
     rest = "".join(f"\n- {claim}: {'; '.join(groups)}" for claim, groups in missing.items())

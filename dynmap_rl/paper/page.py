@@ -11,13 +11,11 @@ from dynmap_rl.utils.files import read_json, write_bytes
 from .cells import TABLES, TASKS, Key
 from .failures import markdown_failures
 from .findings import compare_cells, markdown_claims, markdown_comparisons, markdown_transfer
+from .measurements import UNITS, markdown_ablations, markdown_measurements, markdown_perception
 from .published import METRICS
-from .results import COLUMNS, Cell, read_cells
+from .results import COLUMNS, Cell, find_repeated, read_cells
 from .tables import OWN, join_table, markdown_column, markdown_overview, markdown_own
 
-UNITS = {"DR": "%", "PE": "mm"}
-PERCEPTION = "object_error", "chroma_explained", "goal_explained", "background_error"
-HEAD = ["", "on", "colour error", "chroma", "goal", "background", "cart", "open loop: cart, block"]
 MAIN = "RGB+[P+V]", "Only-RGB"  # rows of the table in the main README
 MARKS = "<!-- results -->", "<!-- /results -->"
 COMMAND = "python recipes/paper/tables.py --write"
@@ -49,21 +47,26 @@ paper.
 
 {overview}
 
+{repeated}
+
 ## The paper's claims
 
 The claims of the paper's Sec. V on success, drops and position errors are sets of comparisons of two cells, paired over the
 1,000 scenes that both share. A gap is the difference of the two, in percentage points of SR or DR, or in mm of PE, with a
-95 % interval over the scenes and p, the probability of a gap of this size by chance
+95 % interval over the scenes and p: how often a gap at least as large would arise if there were no true one
 ([how](../../dynmap_rl/evaluation/statistics.py)). Both say nothing about further trainings. The 95 % interval over world models
 does: paired where both cells are of the same world models, otherwise Welch's. With three on either side it is wide. The paper's
 gaps are differences of its means over three policies.
 
 A comparison holds if p is below 0.05 and the interval over world models lies on the side that the claim says. It does not
-hold if that interval lies on the other side. Otherwise it is open, also with a single world model on one side or without any
-variation between them. A claim has a verdict if all of its comparisons agree, which the paper's own gaps often do not. Single
+hold if that interval lies on the other side. Otherwise it is open. It is also open if one side has a single world model, or
+if all world models have the same rate. A claim holds if all of its comparisons hold. It does not hold if some do not and none
+holds; if some hold and some do not, it is mixed. Otherwise it is open. The paper's own gaps often have both signs. Single
 comparisons are not corrected for their number, and those with one and the same cell, such as Only-RGB, are no independent
-evidence. Comparisons of two tasks pair scenes by their number alone. "Recurrent policies gain less by dynamics" compares what
-recurrent policies have more than feed-forward ones, with dynamics and with Only-RGB.
+evidence. Where one side has the same rate with every world model, as at 100 %, the interval is that of the other side alone.
+Scenes of two tasks have nothing in common but their number; pairing them neither helps nor harms. "Recurrent policies gain
+less by dynamics" is a difference of differences: (recurrent - feed-forward) with dynamics, minus the same for Only-RGB.
+Decoupled runs were trained on a CPU, joint and end-to-end ones mostly on a GPU.
 
 Comparisons are of the default encoder unless they name a plain CNN. With the default encoder even Only-RGB nearly solves
 task 1, which leaves no room for gaps. The plain CNN is nearer to the paper, which has "a simple CNN-based encoder" and gives
@@ -111,8 +114,9 @@ policy; 95 % interval over scenes); and on held-out demonstrations, what stands 
 
 ## What fails
 
-Failed episodes of all policies of as many world models as the row says; or, where results do not name causes, of the first
-policies, run again (`python recipes/paper/figures.py --only failures`). A drop is named after the place and the cart's speed
+Rows marked "all policies" count all policies of the world models whose results name causes. Rows marked "first policy" were run
+again with the first policy alone (`python recipes/paper/figures.py --only failures`), so that their rates differ from those of
+the cells. A drop is named after the place and the cart's speed
 when the block began to tip; the causes are defined in [failures.py](../../dynmap_rl/evaluation/failures.py).
 
 {failures}
@@ -155,6 +159,7 @@ def markdown_page(results: Path) -> str:
         command=COMMAND,
         provenance="\n".join(textwrap.wrap(contents["provenance"], 120)),
         overview=markdown_overview(cells),
+        repeated=_repeated(results / "cells"),
         claims=markdown_claims(comparisons),
         comparisons=markdown_comparisons(comparisons),
         transfer=markdown_transfer(cells),
@@ -164,44 +169,8 @@ def markdown_page(results: Path) -> str:
         failures=_failures(results / "measurements" / "failures.json", cells),
         perception=markdown_perception(read_json(results / "measurements" / "probe.json")),
         media="\n\n".join(f"![{text}](media/{name})\n\n{text}" for name, text in contents["media"].items()),
-        measurements=_measurements(results / "measurements", contents["measurements"]),
+        measurements=markdown_measurements(results / "measurements", contents["measurements"]),
     )
-
-
-def markdown_perception(probe: dict) -> str:
-    """Return a table of what the world models of a ``probe.json`` see (see ``recipes/probe.py``)."""
-    lines = []
-    for name, places in probe["perception"].items():
-        for where, found in places.items():
-            last = {
-                key: values[-1] for key, values in probe["open_loop"].get(name, {}).get("model", {}).items()
-            }
-            held_out = where == "held-out demonstrations" and last
-            lines.append([
-                name, where, *(f"{found[key]:.2f}" for key in PERCEPTION), f"{1000 * found['cart_error']:.1f} mm",
-                f"{last['cart_mm']:.1f} mm, {last['block_mm']:.1f} mm" if held_out else "",
-            ])  # fmt: skip
-    return join_table(HEAD, lines)
-
-
-def markdown_ablations(found: dict) -> str:
-    """Return a table of the measurements of the ablations' world models.
-
-    Args:
-        found: ``late``, the evaluation of each row's policy on late frames, and ``world_models``, for each row with a
-            world model of its own the entries of ``probe.json`` (see ``recipes/probe.py``): ``perception`` on held-out
-            demonstrations, and ``open_loop``.
-    """
-    lines = []
-    for row, late in found["late"].items():
-        low, high = late["SR_interval"]
-        line = [row, f"{late['DR']:.1f}", f"**{late['SR']:.1f}** [{low:.1f}, {high:.1f}]"]
-        if probe := found["world_models"].get(row):
-            line += [f"{probe[key]:.2f}" for key in PERCEPTION]
-            line += [f"{1000 * probe['cart_error']:.1f} mm"]
-            line += [f"{probe['cart_mm']:.0f} mm, {probe['block_mm']:.0f} mm"]
-        lines.append(line + [""] * (len(HEAD) - len(line) + 1))
-    return join_table(["", "DR, late frames", "SR, late frames", *HEAD[2:]], lines)
 
 
 def markdown_runs(results: Path) -> str:
@@ -270,27 +239,13 @@ def write_results_page(results: Path, readme: Path) -> list[Path]:
     return changed
 
 
+def _repeated(folder: Path) -> str:
+    names = ", ".join(find_repeated(folder))
+    return (
+        f"On another training of the world model of the run that they name, which was repeated: {names}."
+        * bool(names)
+    )
+
+
 def _failures(path: Path, cells: Mapping[Key, Cell]) -> str:
     return markdown_failures(read_json(path)["failures"] if path.exists() else [], cells)
-
-
-def _measurements(folder: Path, contents: dict[str, dict]) -> str:
-    rows = []
-    for name, entry in contents.items():
-        result = read_json(folder / name)
-        command = result.get("command", entry["command"])
-        rows.append([f"[{name}](measurements/{name})", entry["what"], _headline(result), f"`{command}`"])
-    return join_table(["file", "what", "result", "command"], rows)
-
-
-def _headline(result: dict) -> str:
-    """Return the success rate of a measurement that has one, with the other metrics of the task."""
-    if summary := result.get("summary") or result.get("test_protocol"):
-        low, high = summary["SR_interval"]
-        names = [name for name in METRICS.get(result["task"], ()) if name in UNITS]
-        others = [f"{name} {summary[name]:.1f} {UNITS[name]}" for name in names]
-        return ", ".join([f"SR {summary['SR']:.1f} % [{low:.1f}, {high:.1f}]", *others])
-    if rates := result.get("rates"):
-        low, high = result["intervals"]["success"]
-        return f"success {rates['success']:.1f} % [{low:.1f}, {high:.1f}]"
-    return f"success {result['pc_success']:.1f} % of {result['n_episodes']}" if "pc_success" in result else ""

@@ -131,6 +131,26 @@ def _read_cell(results: Path, key: Key, runs: list[Run]) -> Cell:
     return Cell(key, runs[0].table, tuple(map(read_json, paths)), len(runs) - len(paths))
 
 
+def find_repeated(folder: Path) -> list[str]:
+    """Return the runs whose frozen world model is of another training of the run that they name, which was repeated.
+
+    Args:
+        folder: see :func:`read_cells`.
+    """
+    found = []
+    for run in list_runs():
+        path, source = folder / f"{run.name}.json", folder / f"{run.needed_run}.json"
+        if not (run.needs and path.exists() and source.exists()):
+            continue
+        named = read_json(source)
+        seed = int(run.needs.partition("/seed_")[2] or 0)
+        if read_json(path)["world_model_sha256"] not in (
+            named.get("world_model_sha256"), named["results"][seed].get("world_model_sha256"),
+        ):  # fmt: skip
+            found.append(run.name)
+    return found
+
+
 def count_commits(cells: Iterable[Cell]) -> Counter[str]:
     """Return how many runs of some cells each commit has made."""
     return Counter(str(result.get("commit")) for cell in cells for result in cell.results)

@@ -10,8 +10,10 @@ from dynmap_rl.paper.claims import list_pairs
 from dynmap_rl.paper.findings import (
     FAILED,
     HOLDS,
+    MIXED,
     OPEN,
     compare_cells,
+    judge_claim,
     markdown_claims,
     markdown_comparisons,
     markdown_transfer,
@@ -161,9 +163,23 @@ def test_verdicts_are_counted(tmp_path):
     verdicts = {name: row["verdict"] for (claim, _, name, _), row in found.items() if claim == BETTER}
     assert verdicts == {"RGB+[P]": HOLDS, "RGB+[V]": FAILED, "RGB+[A]": OPEN}
     lines = markdown_claims(list(found.values())).splitlines()
-    gaps = "-3 to +11 | -37.5 to +50.0 points"
-    assert f"| {BETTER} | {group} | SR | {gaps} | 1 | 1 | 1 | **open** |" in lines
+    gaps = "+2 to +11 | -37.5 to +50.0 points"  # of the three that were run
+    assert f"| {BETTER} | {group} | SR | {gaps} | 1 | 1 | 1 | **mixed** |" in lines
     assert "- World models are better than End-to-End: task 1, joint" in lines
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "claim"),
+    [
+        ([HOLDS, HOLDS], HOLDS),
+        ([HOLDS, OPEN], OPEN),
+        ([FAILED, OPEN], FAILED),
+        ([HOLDS, FAILED, OPEN], MIXED),
+        ([OPEN], OPEN),
+    ],
+)
+def test_one_comparison_that_fails_refutes_a_claim(verdicts, claim):
+    assert judge_claim([{"verdict": verdict} for verdict in verdicts]) == claim
 
 
 def test_predictions_are_compared_by_task(tmp_path):

@@ -4,7 +4,7 @@ import pytest
 from made_up import TASK, write
 from scipy.stats import t
 
-from dynmap_rl.paper.results import count_commits, read_cells
+from dynmap_rl.paper.results import count_commits, find_repeated, read_cells
 
 KEY = TASK, "decoupled", "recurrent", "RGB+[P]"
 
@@ -45,6 +45,16 @@ def test_commits_are_counted_by_run(tmp_path):
     write(tmp_path, "RGB+[P]", 40, 30, commit="abc")
     write(tmp_path, "RGB+[V]", 40, commit="def")
     assert count_commits(read_cells(tmp_path).values()) == {"abc": 2, "def": 1}
+
+
+def test_runs_on_another_training_of_a_world_model_are_named(tmp_path):
+    write(tmp_path, "RGB+[P]", 40, 40)
+    for task, successes in (("bin_dropping", (20, 20)), ("balance_reaching_obstacle", (20,))):
+        write(tmp_path, "RGB+[P]", *successes, task=task)
+    assert find_repeated(tmp_path) == []
+    path = tmp_path / "bin_dropping_decoupled_position_recurrent_world_model_1.json"
+    path.write_text(path.read_text().replace('"decoupled RGB+[P] 1"', '"another"'))
+    assert find_repeated(tmp_path) == [path.stem]
 
 
 def test_rows_that_the_paper_lacks_are_of_other_tables(tmp_path):
