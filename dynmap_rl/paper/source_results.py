@@ -89,6 +89,8 @@ def read_source(results: Path, task: str, source: str, policy: str, size: int = 
     if not found:
         return None
     by_model = [result_rows(result) for result in found]
+    if source == "end_to_end":  # each of its policies has a world model of its own
+        by_model = [[of_seed] for of_seed in by_model[0]]
     rows = [of_seed for model in by_model for of_seed in model]
     everything = summarize([row for of_seed in rows for row in of_seed])
     measured = [
@@ -145,12 +147,13 @@ def _rate(cell: dict | None, none: dict | None, full: dict | None) -> list[str]:
 
 
 def data_table(results: Path, task: str) -> str:
-    """Return SR against the number of demonstrations in Markdown, recurrent policies."""
+    """Return SR against the number of demonstrations in Markdown, recurrent policies; also of each of several world models."""
     lines = []
     for name, text in DATA_ROWS.items():
         cells = [read_source(results, task, name, "recurrent", size) for size in SIZES]
         if any(cells):
-            lines.append([text, *(_rate(cell, None, None)[0] for cell in cells)])
+            rates = [_rate(cell, None, None) for cell in cells]
+            lines.append([text, *(f"{rate} ({each})" if "," in each else rate for rate, each, _ in rates)])
     return join_table(["", *map(str, SIZES)], lines)
 
 
