@@ -65,7 +65,7 @@ def main(config: Config) -> None:
     from dynmap_rl.runs.loggers import check_logger
     from dynmap_rl.training.dagger import check_corrections
     from dynmap_rl.training.dataset import check_dataset, choose_augmentation, find_or_record
-    from dynmap_rl.training.decoupled import check_same, train_policies
+    from dynmap_rl.training.decoupled import check_copies, check_same, train_policies
     from dynmap_rl.training.settings import check_windows
     from dynmap_rl.training.world_model import build_world_model, train_world_model
     from dynmap_rl.utils.devices import choose_device, seed_everything
@@ -77,6 +77,7 @@ def main(config: Config) -> None:
     device = choose_device(config.compute.device)
     check_logger(config.logger)
     check_corrections(config.policy, config.task)
+    check_copies(config.policy, config.task)
     if config.dataset:
         check_dataset(config.dataset, config.task)
     world_model = load_pretrained(config) if config.pretrained else None

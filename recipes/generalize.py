@@ -60,7 +60,7 @@ def main(config: Config) -> None:
     from dynmap_rl.runs.lookup import load_world_model_of
     from dynmap_rl.training.dagger import check_corrections
     from dynmap_rl.training.dataset import check_dataset, find_or_record
-    from dynmap_rl.training.decoupled import check_same, train_policies
+    from dynmap_rl.training.decoupled import check_copies, check_same, train_policies
     from dynmap_rl.utils.devices import choose_device
     from dynmap_rl.utils.files import read_json
 
@@ -68,6 +68,7 @@ def main(config: Config) -> None:
     choose_device(config.compute.device)
     check_logger(config.logger)
     check_corrections(config.policy, config.task)
+    check_copies(config.policy, config.task)
     if config.dataset:
         check_dataset(config.dataset, config.task)
     world_model, origin = load_world_model_of(config.pretrained)

@@ -74,7 +74,7 @@ def main(config: Config) -> None:
     from dynmap_rl.runs.loggers import check_logger
     from dynmap_rl.training.dagger import check_corrections
     from dynmap_rl.training.dataset import keep_dataset
-    from dynmap_rl.training.decoupled import train_policies
+    from dynmap_rl.training.decoupled import check_copies, train_policies
     from dynmap_rl.training.joint import train_seeds
     from dynmap_rl.training.world_model import build_world_model, train_world_model
     from dynmap_rl.utils.devices import choose_device, seed_everything
@@ -84,6 +84,7 @@ def main(config: Config) -> None:
     seeds, device = parse_seeds(config.seeds), choose_device(config.compute.device)
     check_logger(config.logger)
     check_corrections(config.policy, None)
+    check_copies(config.policy, None)
     supervision = parse_supervision(config.world_model.supervision)
     steps = (config.joint if config.method == "joint" else config.world_model).window_steps
     data = describe_robot_dataset(config.dataset, config.camera, config.goal, supervision, steps)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tqdm import tqdm
@@ -15,6 +17,7 @@ def compute_features(
     world_model: WorldModel,
     episodes: TensorDictBase,
     batch: int = 10,
+    change: Callable[[TensorDictBase], TensorDictBase] | None = None,
 ) -> TensorDict:
     """Compute latents and hidden states of whole episodes.
 
@@ -23,6 +26,7 @@ def compute_features(
         episodes: ``[E, T]`` with ``pixels``, ``action``, ``goal``, ``dynamics`` and, optional, ``expert_action`` and
             ``disturbed``.
         batch: number of episodes computed at a time.
+        change: function of the episodes of a batch that is applied first, such as :func:`dynmap_rl.data.augment`.
 
     Returns:
         ``[E, T]`` with ``latent``, ``hidden1``, ``hidden2``, ``goal``, the ``action`` to imitate, and ``disturbed`` bool
@@ -38,7 +42,7 @@ def compute_features(
         episodes["step_count"] = steps[:, None].expand(*episodes.shape, 1)
     parts = []
     for chunk in tqdm(episodes.split(batch), "states", leave=False):
-        chunk = chunk.to(device)
+        chunk = (change(chunk) if change else chunk).to(device)
         latent = world_model.encode(chunk["pixels"], mixed=True)
         _, hidden1, hidden2 = world_model.predict(latent, chunk["action"])
         features = {"latent": latent, "hidden1": hidden1, "hidden2": hidden2}

@@ -65,10 +65,13 @@ SOURCES = {
     "command_tracks": Source("commanded cart pose, and tracks", COMMAND | {"source": "state,tracks"}),
     "informed": Source("simulator, no RGB loss", None, ("--world_model.beta_rgb", "0")),
 }
+COPIES = "_copies"  # end of the names of rows whose policies are also trained on augmented copies
 DATA_ROWS = {
     "none": "Only-RGB",
     "tracks": "RGB+[P+V], tracked",
     "simulator": "RGB+[P+V]",
+    f"none{COPIES}": "Only-RGB, 15 copies",
+    f"simulator{COPIES}": "RGB+[P+V], 15 copies",
     "end_to_end": "End-to-End",
 }
 
@@ -113,7 +116,7 @@ def list_data_runs(
     """
     runs = []
     for size in SIZES:
-        names = [name for name in DATA_ROWS if name in only and name in SOURCES]
+        names = [name for name in DATA_ROWS if name in only and name != "end_to_end"]
         runs += [
             _train(TASKS[0], name, seed, datasets, size, architecture) for seed in seeds for name in names
         ]
@@ -207,11 +210,13 @@ def _train(
     task: str, name: str, seed: int, datasets: Path, size: int = 300, architecture: str = "glimpse"
 ) -> Run:
     """Return the run that trains a world model and recurrent policies."""
-    source = SOURCES[name]
+    source = SOURCES[name.removesuffix(COPIES)]
+    dataset = dataset_folder(task, name.removesuffix(COPIES), datasets, size)
     arguments = (
-        "--task", task, "--dataset", str(dataset_folder(task, name, datasets, size)),
+        "--task", task, "--dataset", str(dataset),
         "--world_model.supervision", source.supervision, "--eval.paper_episodes", "0",
         "--world_model.seed", str(seed), *source.options,
+        *(("--policy.copies", "15") if name.endswith(COPIES) else ()),
     )  # fmt: skip
     arguments += _form(architecture)
     cell = task, "decoupled", "recurrent", source.text

@@ -9,13 +9,17 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import nn
 
+from dynmap_rl.data.augmentation import augment
 from dynmap_rl.data.features import compute_features
+from dynmap_rl.data.settings import Augmentation
+from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.modules.checkpoints import (
     load_policy,
     load_world_model,
@@ -30,11 +34,20 @@ from dynmap_rl.utils.processes import run_processes
 from dynmap_rl.utils.weights import fingerprint
 
 from .dagger import add_corrections, check_corrections
+from .dataset import choose_augmentation
 from .policy import train_policy
 from .settings import PolicyTraining
 
 TRAINED = "trained.json"  # written after a policy's training, with the world model's fingerprint
 Judge = Callable[[WorldModel, nn.Module], dict]
+
+
+def check_copies(settings: PolicyTraining, task: str | None) -> None:
+    """Raise ``ValueError`` for augmented copies where the episodes are not of a task in the plane."""
+    if settings.copies and not (task and get_task(task).planar):
+        raise ValueError(
+            f"PolicyTraining.copies need a task in the plane, such as balance_reaching, got {task}; use 0 copies"
+        )
 
 
 def check_same(world_model: WorldModel, result: dict, folder: Path) -> None:
@@ -69,7 +82,7 @@ def train_policies(
         judge: function of world model and policy to the content of ``eval.json``. With more than one thread it must
             be picklable, such as a ``functools.partial`` of
             :func:`dynmap_rl.evaluation.protocol.judge_in_closed_loop`.
-        task: name of the task, whose expert gives the corrections of the settings.
+        task: name of the task, whose scenes say how copies may change, and whose expert gives corrections.
         seeds: seeds of the policies.
         compute: device, and policies trained at a time.
         logger: ``tensorboard``, ``wandb``, ``trackio`` or None.
@@ -78,11 +91,13 @@ def train_policies(
         The fingerprint of the frozen world model.
 
     Raises:
-        ValueError: the frozen weights have changed, or corrections are wanted and there is no expert.
+        ValueError: the frozen weights have changed, corrections are wanted and there is no expert, or copies and there is
+            no task in the plane.
         OSError: a process died, or the disk is full.
     """
     settings, compute, folder = settings or PolicyTraining(), compute or Compute(), Path(folder)
     check_corrections(settings, task)
+    check_copies(settings, task)
     world_model.eval().requires_grad_(False)
     frozen = fingerprint(world_model)
     save_world_model(folder / "world_model", world_model)
@@ -91,7 +106,7 @@ def train_policies(
         states = folder / "features"
         shutil.rmtree(states, ignore_errors=True)  # left behind by a kill
         try:
-            _write_features(world_model, episodes, states, compute.device)
+            _write_features(world_model, episodes, states, compute.device, settings.copies, task)
             run_processes([_train, _evaluate], [(work, seed) for seed in todo], compute.threads)
         finally:
             shutil.rmtree(states, ignore_errors=True)
@@ -114,10 +129,16 @@ class _Work:
     frozen: str
 
 
-def _write_features(world_model, episodes, states: Path, device: str) -> None:
-    device = choose_device(device)
-    world_model.to(device)
+def _write_features(
+    world_model, episodes, states: Path, device: str, copies: int = 0, task: str | None = None
+) -> None:
+    world_model.to(choose_device(device))
     train, held_out = (compute_features(world_model, episodes[split]) for split in ("train", "eval"))
+    if copies:
+        augmentation = choose_augmentation(get_task(task), Augmentation(), imitated=True)
+        change = partial(augment, generator=torch.Generator().manual_seed(0), settings=augmentation)
+        more = [compute_features(world_model, episodes["train"], change=change) for _ in range(copies)]
+        train = torch.cat([train, *more])
     check_space(states.parent, train.bytes() + held_out.bytes())
     for name, values in (("train", train), ("eval", held_out)):
         values.cpu().memmap(states / name)

@@ -114,6 +114,9 @@ class PolicyTraining(PolicyArchitecture):
     learning_rate: float = 3e-3
     # Extra weight of steps in which the expert changes its action (see imitation_loss); 0 is the paper's plain L1.
     emphasis: float = 60.0
+    # Augmented copies of every demonstration, whose states join its own (see Augmentation; mirroring and shifting need a
+    # symmetric task).
+    copies: int = 0
     # Scenes of training in which the trained policy acts and the task's expert says what it would have done (DAgger).
     # Their states join the demonstrations', and training goes on.
     corrections: int = 0
@@ -123,7 +126,7 @@ class PolicyTraining(PolicyArchitecture):
     def __post_init__(self):
         super().__post_init__()
         check_at_least(self, 1, "updates", "batch", "correction_updates")
-        check_at_least(self, 0, "learning_rate", "emphasis", "corrections")
+        check_at_least(self, 0, "learning_rate", "emphasis", "copies", "corrections")
 
 
 @dataclass(frozen=True)

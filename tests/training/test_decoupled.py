@@ -1,6 +1,7 @@
 """Policies on a frozen world model: nothing finished is repeated, and the world model stays as it is."""
 
 import shutil
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -8,15 +9,17 @@ import torch
 from safetensors.torch import load_file, save_file
 from small import CONSTANTS, POLICY, Stop, judge, make_episodes, make_model, read_weights
 
-from dynmap_rl.training import decoupled, train_policies
+from dynmap_rl.training import PolicyTraining, decoupled, train_policies
 from dynmap_rl.utils.devices import Compute
 from dynmap_rl.utils.files import read_json
 from dynmap_rl.utils.weights import fingerprint
 
 
-def train(folder, model=None, judge=judge, seeds=(0,), threads=1):
+def train(folder, model=None, judge=judge, seeds=(0,), threads=1, settings=POLICY, **more):
     common = {"judge": judge, "seeds": seeds, "compute": Compute("cpu", threads)}
-    return train_policies(model or make_model(), make_episodes(), CONSTANTS, folder, POLICY, **common)
+    return train_policies(
+        model or make_model(), make_episodes(), CONSTANTS, folder, settings, **common, **more
+    )
 
 
 def stop(*args, **kwargs):
@@ -72,6 +75,31 @@ def test_a_finished_seed_is_left_alone(tmp_path, monkeypatch):
     train(tmp_path)
     monkeypatch.setattr(decoupled, "compute_features", stop)
     train(tmp_path, judge=stop)
+
+
+def test_a_policy_sees_the_states_of_augmented_copies(tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(
+        decoupled, "train_policy", lambda policy, features, *_, **__: seen.append(features.clone())
+    )
+    for task in ("balance_reaching", "bin_dropping"):
+        train(tmp_path / task, settings=replace(POLICY, copies=2), task=task)
+    symmetric, other = seen
+    assert len(symmetric) == len(other) == 3 * len(make_episodes()["train"])
+    original, first, second = symmetric.split(3)
+    for key in ("latent", "action", "goal"):
+        assert torch.equal(other[key][:3], original[key])
+        assert not torch.equal(first[key], original[key]) and not torch.equal(first[key], second[key])
+    assert torch.equal(other["goal"][3:6], original["goal"]), "scenes of task 3 cannot be mirrored or shifted"
+    assert not torch.equal(other["latent"][3:6], original["latent"]), "but be recoloured"
+
+
+@pytest.mark.parametrize("task", [None, "mujoco:FetchPush"])
+def test_copies_need_a_task_in_the_plane(task):
+    if task:
+        pytest.importorskip("mujoco")
+    with pytest.raises(ValueError, match="copies need a task in the plane"):
+        decoupled.check_copies(PolicyTraining(copies=1), task)
 
 
 def test_states_that_do_not_fit_on_the_disk_are_not_written(tmp_path, monkeypatch):
