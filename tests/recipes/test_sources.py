@@ -53,7 +53,7 @@ def test_every_source_has_three_world_models_and_two_policies(tmp_path):
     assert len(names) == len(set(names)) == 6 * len(SOURCES) and "hours of one core" in said
     assert sum(name.endswith("feedforward") for name in names) == 3 * len(SOURCES)
     data, _ = listed(tmp_path, "--part", "data")
-    assert len(data) == len(SIZES) * (3 * 3 + 1)
+    assert len(data) == len(SIZES) * (3 * 5 + 1)
     both, _ = listed(tmp_path)
     assert set(both) == {*names, *data} and len(set(names) & set(data)) == 9, "those of 300 demonstrations"
     assert {name for name in names if "reaching_tracks_" in name} == set(
