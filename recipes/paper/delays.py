@@ -98,6 +98,7 @@ def main(config: Config) -> None:
 def open_result(config: Config, run: str, condition: str) -> tuple[Path, dict]:
     """Return file and content of the result of a run under a condition, which may be there in part."""
     from dynmap_rl.envs.tasks import get_task
+    from dynmap_rl.paper.delays import find_training
     from dynmap_rl.runs.lookup import find_run, task_of_run
     from dynmap_rl.utils.files import read_json
 
@@ -108,13 +109,14 @@ def open_result(config: Config, run: str, condition: str) -> tuple[Path, dict]:
     name = "_".join([get_task(task).name, *Path(run).parts[-4:], f"seed_{config.seed}", condition])
     path = config.results / f"{name}.json"
     facts = {"run": run, "seed": config.seed, "task": task, "condition": condition}
-    facts |= {"split": config.eval.split, "episodes": config.eval.episodes}
+    facts |= {"split": config.eval.split, "episodes": config.eval.episodes, "trained": find_training(folder)}
     if condition == "past_actions":
         facts |= {"dataset": config.dataset, "training": asdict(config.policy)}
     result = read_json(path) if path.exists() else facts | {"cells": {}}
     if other := [key for key, value in facts.items() if result.get(key) != value]:
         raise ValueError(
-            f"{path} has another {', '.join(other)}; choose another --results or remove the file"
+            f"{path} has another {', '.join(other).replace('trained', 'training of the run')}; choose another --results "
+            "or remove the file"
         )
     return path, result
 
@@ -122,7 +124,7 @@ def open_result(config: Config, run: str, condition: str) -> tuple[Path, dict]:
 def evaluate_cell(config: Config, path: Path, result: dict, steps: int) -> None:
     """Evaluate a run under a condition with one delay, and add the cell to the file."""
     from dynmap_rl.evaluation.protocol import evaluate
-    from dynmap_rl.paper.delays import CONDITIONS, find_training, frame_delay
+    from dynmap_rl.paper.delays import CONDITIONS, frame_delay
     from dynmap_rl.runs.lookup import find_run, has_world_model
     from dynmap_rl.utils.files import write_json
     from dynmap_rl.utils.version import find_commit
@@ -134,7 +136,7 @@ def evaluate_cell(config: Config, path: Path, result: dict, steps: int) -> None:
     found = evaluate(actor, result["task"], config.eval, delay, pushed, workers)["test"]
     cell = {name: found["summary"][name] for name in ("SR", "SR_interval", "DR", "DR_interval", "PE")}
     cell |= {"success": found["rows"]["success"], "command": command_line(sys.argv), "commit": find_commit()}
-    result |= names | {"trained": find_training(find_run(result["run"]))}
+    result |= names
     result["cells"][str(steps)] = cell
     write_json(path, result)
     print(f"    SR {cell['SR']:.1f} %   DR {cell['DR']:.1f} %   PE {cell['PE']:.1f} mm", flush=True)

@@ -57,6 +57,11 @@ def test_cells_are_measured_once(grid, tmp_path):
     assert (tmp_path / "found/README.md").read_bytes() == page
     result = grid("--conditions", "stale", "--eval.split", "validation")
     assert result.returncode == 2 and "another split" in result.stderr
+    write_json(tmp_path / "trained/eval.json", {"command": "python recipes/decoupled.py", "commit": "abc"})
+    result = grid("--conditions", "stale")
+    assert result.returncode == 2 and "another training of the run" in result.stderr, (
+        "the run was trained again"
+    )
 
 
 def test_the_baseline_with_past_actions_is_trained_on_the_run_s_world_model(grid, tmp_path, recording):
