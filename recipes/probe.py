@@ -63,6 +63,10 @@ def main(config: Config) -> None:
     dataset = find_or_record("balance_reaching", config.dataset)
     train = load_dataset(dataset, "train", config.cache)[: config.train_episodes]
     test = load_dataset(dataset, "eval", config.cache)[: config.test_episodes]
+    if "labelled" in test.keys():
+        raise ValueError(
+            "--dataset must have the dynamics of every frame, got tracks with gaps; use the recording that they are of"
+        )
     open_loop = {
         name: open_loop_errors(model, test, config.context, config.horizon)
         for name, model in models.items()

@@ -43,7 +43,7 @@ class Layout:
 
     def __post_init__(self):
         goal = [name for name in self.state if name.startswith("goal_")]
-        if not goal or self.state[-len(goal) :] != tuple(goal):
+        if not goal or list(self.state[-len(goal) :]) != goal:
             raise ValueError(f"state must end with the entries of the goal, named goal_..., got {self.state}")
 
     @property

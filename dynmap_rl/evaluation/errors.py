@@ -48,17 +48,19 @@ def prediction_errors(
         states = world_model.predict(world_model.encode(chunk["pixels"], mixed=True), chunk["action"])
         some = [s[:, 1::10] for s in states]  # a tenth of the frames is enough
         error = world_model.decode_pixels(*some) - chunk["pixels"][:, 1::10] / 255
-        errors = {"rgb": error.square().flatten(2).mean(-1).sqrt()}
+        rgb = error.square().flatten(2).mean(-1).sqrt()
+        errors = {"rgb": (rgb, torch.ones_like(rgb, dtype=torch.bool))}
         for name, value in world_model.decode_dynamics(*states).items():
-            difference = (value - known_dynamics(chunk, name))[:, 1:].abs()
+            truth = known_dynamics(chunk, name)
+            difference, known = (value - truth)[:, 1:].abs(), truth[:, 1:].isfinite()
             size = difference.shape[-1]
             groups = {g: [i for i in range(size) if i % 3 in entries] for g, entries in GROUPS.items()}
             for group, entries in ({f"_{i}": [i] for i in range(size)} if by_entry else groups).items():
                 if entries:  # a point has no angle
-                    errors[f"{name}{group}"] = difference[..., entries]
-        for name, value in errors.items():
-            sums[f"error_{name}"] += value.nansum().item()
-            counts[f"error_{name}"] += value.isfinite().sum().item()
+                    errors[f"{name}{group}"] = difference[..., entries], known[..., entries]
+        for name, (value, known) in errors.items():
+            sums[f"error_{name}"] += value[known].sum().item()
+            counts[f"error_{name}"] += known.sum().item()
     return {name: sums[name] / (counts[name] or torch.nan) for name in counts}
 
 

@@ -105,7 +105,7 @@ def markdown_failures(failures: list[dict], cells: Mapping[Key, Cell]) -> str:
         cell = replace(cell, results=tuple(named))
         episodes = [episode for rows in cell.policies for episode in rows]
         if counts := Counter(episode["cause"] for episode in episodes if "cause" in episode):
-            training = "end_to_end" if row == "End-to-End" else training
+            training = "end_to_end" if row.startswith("End-to-End") else training
             facts = {
                 "task": task,
                 "training": training,

@@ -34,7 +34,8 @@ def write_source_page(results: Path, tasks: list[str], architecture: str = "glim
         "# Sources of dynamics, and numbers of demonstrations",
         f"World models have {FORMS[architecture]}. SR in % with 95 % intervals over the test scenes, which do not cover "
         "differences between trainings. Share of the gain: (SR - SR of Only-RGB) / (SR with the simulator's dynamics - SR "
-        "of Only-RGB). Measures are means over the world models that have been probed. Derived "
+        "of Only-RGB). Policies of rows with 15 copies are also trained on the states of 15 augmented copies of every "
+        "demonstration. Measures are means over the world models that have been probed. Derived "
         "columns have the verdict of `add_dynamics.py`, before any training, with the checks that failed. Written by "
         "`recipes/paper/sources.py --write`.",
     ]

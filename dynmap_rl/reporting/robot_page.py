@@ -58,7 +58,8 @@ def write_robot_report(
         The content of ``eval.json``. ``held_out`` has means over the seeds: ``rgb`` (root mean square, 0 to 1),
         ``imitation_l1`` (normalised) and, in the dataset's units, the mean absolute error of every entry of the action
         and of the supervised dynamics, one step ahead. ``spread`` has the mean absolute error of the best constant, and
-        ``change`` that of the value one step earlier. Dynamics that were not found in the frames are left out.
+        ``change`` that of the value one step earlier. Dynamics that were not found in the frames, and
+        actions of disturbed steps, are left out.
 
     Raises:
         ValueError: a seed was evaluated with another world model.
@@ -124,7 +125,10 @@ def robot_row_text(result: dict) -> str:
 
 
 def _values(episodes: TensorDictBase, quantity: str) -> torch.Tensor:
-    return episodes["action"] if quantity == "action" else known_dynamics(episodes, quantity)
+    if quantity != "action":
+        return known_dynamics(episodes, quantity)
+    pushed = episodes.get("disturbed", None)
+    return episodes["action"] if pushed is None else episodes["action"].where(~pushed, torch.nan)
 
 
 def _change(episodes: TensorDictBase, quantity: str) -> list[float]:

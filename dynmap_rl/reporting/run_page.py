@@ -139,8 +139,11 @@ def _paper_protocol(results: list[dict]) -> dict:
 
 def _localization(results: list[dict]) -> dict[str, float]:
     """Return the mean over the seeds of the world model's errors in the cart's position (mm)."""
-    names = [name for name in results[0]["test"]["summary"] if name.startswith("localization")]
-    return {name: float(np.mean([r["test"]["summary"][name] for r in results])) for name in names}
+    summaries = [result["test"]["summary"] for result in results]
+    found = {
+        name: [s[name] for s in summaries if name in s] for name in ("localization", "localization_away")
+    }
+    return {name: float(np.mean(values)) for name, values in found.items() if values}
 
 
 def _draw(folder: Path, world_model: WorldModel, episodes: TensorDictBase, result: dict) -> None:

@@ -26,7 +26,7 @@ def open_run(folder: Path, config, *, ignore: tuple[str, ...] = ()) -> Path:
 
     Args:
         folder: run folder.
-        config: dataclass of settings.
+        config: dataclass of settings, all with defaults, which a run has that is older than a setting.
         ignore: names of settings that may differ from those of the folder, such as ``run`` or ``ppo.iterations``.
 
     Returns:
@@ -52,7 +52,8 @@ def _open(folder: Path, config, ignore: tuple[str, ...]) -> Path:
         raise ValueError(
             f"{folder} holds a run of another release, which cannot resume here; choose another --run"
         )
-    flat = (flatten(s).items() for s in (stored, settings))
+    defaults = flatten(plain_settings(type(config)()))  # of settings that are younger than the run
+    flat = (s.items() for s in (defaults | flatten(stored), flatten(settings)))
     old, new = ({k: v for k, v in s if not {k, k.partition(".")[0]} & set(ignore)} for s in flat)
     if changed := sorted(k for k in {*old, *new} if old.get(k) != new.get(k)):
         detail = ", ".join(f"{k}: {old.get(k)} there, {new.get(k)} here" for k in changed)

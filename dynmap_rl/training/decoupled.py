@@ -137,8 +137,9 @@ def _write_features(
     if copies:
         augmentation = choose_augmentation(get_task(task), Augmentation(), imitated=True)
         change = partial(augment, generator=torch.Generator().manual_seed(0), settings=augmentation)
-        more = [compute_features(world_model, episodes["train"], change=change) for _ in range(copies)]
-        train = torch.cat([train, *more])
+        check_space(states.parent, train.bytes() * (1 + copies) + held_out.bytes())
+        more = (compute_features(world_model, episodes["train"], change=change).cpu() for _ in range(copies))
+        train = torch.cat([train.cpu(), *more])
     check_space(states.parent, train.bytes() + held_out.bytes())
     for name, values in (("train", train), ("eval", held_out)):
         values.cpu().memmap(states / name)

@@ -82,8 +82,8 @@ def train_ppo(
         lmbda=settings.gae_lambda,
         value_network=critic,
         average_gae=True,
-        shifted=settings.steps
-        <= EPISODE_STEPS,  # one pass of the critic, where no episode ends within a rollout
+        # One pass of the critic, where no time limit falls into a rollout.
+        shifted=settings.steps <= EPISODE_STEPS,
     )
     policy_loss = ClipPPOLoss(
         actor,

@@ -67,7 +67,7 @@ def main(config: Config) -> None:
 
     recipe, baseline = "recipes/paper/delays.py", PolicyTraining(kind="feedforward")
     refuse(config.eval, Evaluation(paper_episodes=0), ["paper_episodes"], recipe, "eval.")
-    refuse(config.policy, baseline, ["kind", "corrections"], recipe, "policy.")
+    refuse(config.policy, baseline, ["kind", "copies", "corrections"], recipe, "policy.")
     if config.write:
         return write(config)
     conditions = config.conditions.split(",") if config.conditions else list(CONDITIONS)
@@ -99,7 +99,7 @@ def open_result(config: Config, run: str, condition: str) -> tuple[Path, dict]:
     """Return file and content of the result of a run under a condition, which may be there in part."""
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.paper.delays import find_training
-    from dynmap_rl.runs.lookup import find_run, task_of_run
+    from dynmap_rl.runs.lookup import find_run, has_world_model, task_of_run
     from dynmap_rl.utils.files import read_json
 
     folder = find_run(run)
@@ -109,10 +109,14 @@ def open_result(config: Config, run: str, condition: str) -> tuple[Path, dict]:
     name = "_".join([get_task(task).name, *Path(run).parts[-4:], f"seed_{config.seed}", condition])
     path = config.results / f"{name}.json"
     facts = {"run": run, "seed": config.seed, "task": task, "condition": condition}
-    facts |= {"split": config.eval.split, "episodes": config.eval.episodes, "trained": find_training(folder)}
+    facts |= {"split": config.eval.split, "episodes": config.eval.episodes}
     if condition == "past_actions":
         facts |= {"dataset": config.dataset, "training": asdict(config.policy)}
-    result = read_json(path) if path.exists() else facts | {"cells": {}}
+    trained = {"trained": find_training(folder)}
+    result = read_json(path) if path.exists() else facts | trained | {"cells": {}}
+    if "training" in result:  # settings that are younger than the result had their defaults
+        result["training"] = asdict(PolicyTraining()) | result["training"]
+    facts |= trained if has_world_model(folder) else {}
     if other := [key for key, value in facts.items() if result.get(key) != value]:
         raise ValueError(
             f"{path} has another {', '.join(other).replace('trained', 'training of the run')}; choose another --results "

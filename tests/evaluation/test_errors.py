@@ -50,6 +50,11 @@ def test_dynamics_that_were_not_found_are_left_out(episodes):
     assert found["error_position_0"] == pytest.approx(error[..., 0][known[:, 1:, 0]].mean().item(), rel=1e-3)
     assert found["error_position_1"] == pytest.approx(error[..., 1].mean().item(), rel=1e-3)
     assert math.isnan(found["error_position_5"]), "never found"
+    with torch.no_grad():
+        next(model.dynamics_decoder.parameters()).fill_(torch.nan)
+    assert math.isnan(prediction_errors(model, episodes, by_entry=True)["error_position_1"]), (
+        "a wrong prediction counts"
+    )
 
 
 @torch.no_grad()

@@ -1,11 +1,16 @@
 """The grid of delays, in a small size: cells, resuming, page and figure."""
 
+import shutil
+from pathlib import Path
+
 import pytest
 from commands import run
 from small import CONSTANTS, make_model
 
 from dynmap_rl.modules.checkpoints import make_policy, save_policy, save_world_model
 from dynmap_rl.utils.files import read_json, write_json
+
+RESULTS = Path(__file__).parents[2] / "recipes/results/delays"
 
 
 @pytest.fixture
@@ -62,6 +67,13 @@ def test_cells_are_measured_once(grid, tmp_path):
     assert result.returncode == 2 and "another training of the run" in result.stderr, (
         "the run was trained again"
     )
+
+
+def test_published_results_can_be_extended(tmp_path):
+    shutil.copytree(RESULTS, tmp_path / "found")
+    arguments = "--runs", "balance_reaching", "--results", "found", "--dry_run"
+    result = run(tmp_path, "delays", *arguments)
+    assert result.returncode == 0, result.stderr
 
 
 def test_the_baseline_with_past_actions_is_trained_on_the_run_s_world_model(grid, tmp_path, recording):

@@ -5,6 +5,7 @@ import shutil
 import pytest
 from commands import run
 
+from dynmap_rl.data import add_dynamics
 from dynmap_rl.data.demonstrations import load_meta
 from dynmap_rl.modules.checkpoints import make_world_model, save_world_model
 from dynmap_rl.utils.files import read_json, write_json
@@ -88,3 +89,9 @@ def test_runs_of_one_row_are_named_by_their_folders(trained):
 def test_a_dataset_of_another_task_is_refused(trained, recordings, tmp_path):
     result = run(tmp_path, "probe", "--runs", trained / "none", "--dataset", recordings("bin_dropping"))
     assert result.returncode == 2 and "must be a dataset of balance_reaching" in result.stderr
+
+
+def test_tracks_with_gaps_are_no_truth(trained, recording, tmp_path):
+    add_dynamics(recording, tmp_path / "tracks", source="tracks", replace=True)
+    result = run(tmp_path, "probe", "--runs", trained / "none", "--dataset", "tracks")
+    assert result.returncode == 2 and "must have the dynamics of every frame" in result.stderr

@@ -46,5 +46,9 @@ def test_errors_are_means_over_seeds_beside_those_of_the_best_constant(folder, m
     assert result["trained_on"]["held_out_episodes"] == [4, 7] and "task" not in result
     assert read_json(folder / "eval.json")["held_out"] == result["held_out"] and drawn == [0.1]
     assert "0.2000" in robot_row_text(result) and "0.2000" in (folder / "report.html").read_text()
+    episodes["disturbed"] = torch.zeros(3, 12, 1, dtype=torch.bool)
+    episodes["disturbed"][:, 5:] = True
+    undisturbed = episodes["action"][:, :5, 1].diff(dim=1).abs().mean().item()
+    assert write(folder, episodes)["change"]["action"]["y"] == pytest.approx(undisturbed)
     with pytest.raises(ValueError, match="another world model"):
         write(folder, episodes, frozen="seed 0")

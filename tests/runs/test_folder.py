@@ -45,6 +45,16 @@ def test_a_run_reopens_with_the_same_settings_only(tmp_path):
     assert read_json(tmp_path / "run/config.json")["world_model"] == {"updates": 5, "rate": 0.1}
 
 
+def test_a_run_that_is_older_than_a_setting_has_its_default(tmp_path):
+    open_run(tmp_path, Settings())
+    stored = read_json(tmp_path / "config.json")
+    del stored["world_model"]["rate"]
+    write_json(tmp_path / "config.json", stored)
+    open_run(tmp_path, Settings())
+    with pytest.raises(ValueError, match=r"world_model\.rate: 0\.1 there, 0\.2 here"):
+        open_run(tmp_path, Settings(world_model=Group(rate=0.2)))
+
+
 def test_a_run_of_the_first_release_is_refused(tmp_path):
     """Its settings were flat."""
     write_json(tmp_path / "config.json", {"run": "here", "updates": 5, "rate": 0.1})

@@ -1,7 +1,9 @@
 """PPO: it resumes to the same weights, on any number of threads, and stops where the loss is not finite."""
 
+import math
 import os
 import time
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -64,6 +66,11 @@ def test_checkpoints_and_metrics(finished):
     assert [(f["iteration"], f["episodes"], f["task"]) for f in facts] == [(1, 3, "mine"), (2, 4, "mine")]
     first, last = (load_file(finished / f"checkpoint/iteration_00{i}.safetensors") for i in (1, 2))
     assert any(not torch.equal(first[k], last[k]) for k in first)
+
+
+def test_a_rollout_may_go_on_after_the_time_limit(tmp_path):
+    train(tmp_path, replace(SETTINGS, steps=130, iterations=1))
+    assert math.isfinite(metrics(tmp_path)[0]["loss_critic"])
 
 
 @pytest.mark.parametrize("saved", [False, True])
