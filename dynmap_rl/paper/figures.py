@@ -219,7 +219,7 @@ def plot_losses(panels: dict[str, dict[str, list[str]]], results: Mapping[str, d
         axis.yaxis.set_major_formatter("{x:g}")
         axis.yaxis.set_minor_formatter("{x:g}")
         axis.grid(which="both", alpha=0.3)
-        axis.legend(fontsize=7)
+        axis.legend(fontsize=7, loc="upper right", ncols=1 + len(groups) // 5)
         if not any(len(line.get_xdata()) for line in axis.lines):
             _mark_as_missing(axis)
     save_figure(figure, path)
