@@ -87,8 +87,7 @@ def _transform_pixels(
     columns = (across - shift[:, :1]).clamp(0, width - 1)  # (B, W)
     columns = torch.where(mirror[:, None], width - 1 - columns, columns)
     rows = (down + shift[:, 1:]).clamp(0, height - 1)
-    source = (channels[:, :, None, None] * height + rows[:, None, :, None]) * width + columns[
-        :, None, None, :
-    ]
+    source = channels[:, :, None, None] * height + rows[:, None, :, None]
+    source = source * width + columns[:, None, None, :]
     index = source.flatten(1)[:, None].expand(-1, pixels.shape[1], -1)
     return pixels.flatten(2).gather(2, index).view_as(pixels)

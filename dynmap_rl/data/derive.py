@@ -98,8 +98,8 @@ def add_dynamics(
 
     The columns (float32) are computed for one episode at a time, in float64, with the times of the column ``timestamp``.
     From frames there is also ``dynamics.found`` (bool): whether what an entry belongs to was found in the frame. Other
-    positions are interpolated, and trainings leave these entries out. The new folder appears when it is complete. Videos are hard-linked where the file system can; all other files are
-    copied. A recording of a task stays one, and can be trained on with the recipes of the tasks: its constants of
+    positions are interpolated, and trainings leave these entries out. The new folder appears when it is complete. Videos
+    are hard-linked where the file system can; all other files are copied. A recording of a task stays one, and can be trained on with the recipes of the tasks: its constants of
     normalisation and the names of its dynamics are written anew. ``meta/dynamics.json`` has all settings, and
     the quality of the columns.
 

@@ -134,13 +134,12 @@ def _write_features(
 ) -> None:
     world_model.to(choose_device(device))
     train, held_out = (compute_features(world_model, episodes[split]) for split in ("train", "eval"))
+    check_space(states.parent, train.bytes() * (1 + copies) + held_out.bytes())
     if copies:
         augmentation = choose_augmentation(get_task(task), Augmentation(), imitated=True)
         change = partial(augment, generator=torch.Generator().manual_seed(0), settings=augmentation)
-        check_space(states.parent, train.bytes() * (1 + copies) + held_out.bytes())
         more = (compute_features(world_model, episodes["train"], change=change).cpu() for _ in range(copies))
         train = torch.cat([train.cpu(), *more])
-    check_space(states.parent, train.bytes() + held_out.bytes())
     for name, values in (("train", train), ("eval", held_out)):
         values.cpu().memmap(states / name)
 
