@@ -79,13 +79,8 @@ def policy_errors(policy: nn.Module, features: TensorDictBase) -> dict[str, floa
     features = features.to(next(policy.parameters()).device)
     predicted = policy(*(features[key] for key in (*STATES, "goal")))
     loss = imitation_loss(predicted, features["action"], policy.action, features["disturbed"])
-    entries = (
-        (predicted - features["action"])
-        .abs()
-        .where(~features["disturbed"], torch.nan)
-        .nanmean((0, 1))
-        .tolist()
-    )
+    error = (predicted - features["action"]).abs()
+    entries = error[~features["disturbed"][..., 0]].mean(0).tolist()
     return {"imitation_l1": loss.item()} | {f"error_action_{i}": e for i, e in enumerate(entries)}
 
 

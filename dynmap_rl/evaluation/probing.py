@@ -94,5 +94,5 @@ def _explain(x: torch.Tensor, x_test: torch.Tensor, y: torch.Tensor, y_test: tor
     # This driver accepts constant states too.
     weights = torch.linalg.lstsq(x - mean, y - center, driver="gelsd").solution
     rest = y_test - center - (x_test - mean) @ weights
-    total = (y_test - y_test.nanmean(0)).square().nansum(0)
-    return 1 - rest.square().nansum(0) / total.where(total > 0, torch.nan)
+    total, known = (y_test - y_test.nanmean(0)).square().nansum(0), y_test.isfinite()
+    return 1 - rest.where(known, 0).square().sum(0) / total.where(total > 0, torch.nan)

@@ -47,7 +47,7 @@ the column says how those were trained.
 | Fig. 2, 3, 4, demonstrations | [pictures](#pictures) | `python recipes/paper/figures.py --only fig2,fig3,fig4` |
 | Fig. 5, collection of demonstrations | [recording](../../dynmap_rl/data/README.md#recording) | |
 | Fig. 6, 9, predictions on tasks 1 and 3 | [pictures](#pictures) | `python recipes/paper/figures.py --only fig6,fig9` |
-| Fig. 7, policy losses | {fig7} | `python recipes/paper/figures.py --only fig7` |
+| Fig. 7, policy losses | [pictures](#pictures) | `python recipes/paper/figures.py --only fig7` |
 | Fig. 8, position errors | [pictures](#pictures) | `python recipes/paper/figures.py --only fig8` |
 
 ## Success rates
@@ -168,7 +168,6 @@ def markdown_page(results: Path) -> str:
     return PAGE.format(
         command=COMMAND,
         provenance="\n".join(textwrap.wrap(contents["provenance"], 120)),
-        fig7="[pictures](#pictures)" if "fig7.png" in contents["media"] else "not drawn yet",
         overview=markdown_overview(cells),
         repeated=_repeated(results / "cells"),
         claims=markdown_claims(comparisons),
