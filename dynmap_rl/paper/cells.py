@@ -24,6 +24,11 @@ MINUTES = {  # of one of two busy cores
 }
 VALIDATION = "--eval.split", "validation", "--eval.paper_episodes", "0"
 UNDISTURBED = "datasets/{task}_undisturbed"
+SAME_WINDOWS = {
+    "no permuted colours": ("--world_model.augmentation.recolor", "false"),
+    "no mirrored windows": ("--world_model.augmentation.mirror", "false"),
+    "no shifted windows": ("--world_model.augmentation.max_shift", "0"),
+}
 ABLATIONS = {  # row: options that differ from the default
     "default": (),
     "no emphasis in the L1 loss": ("--policy.emphasis", "0"),
@@ -32,9 +37,8 @@ ABLATIONS = {  # row: options that differ from the default
     "no rarity in the RGB loss": ("--world_model.rarity", "0"),
     "no short windows": ("--world_model.short_windows", "0"),
     "no imagined steps": ("--world_model.imagined", "0"),
-    "no permuted colours": ("--world_model.augmentation.recolor", "false"),
-    "no mirrored windows": ("--world_model.augmentation.mirror", "false"),
-    "no shifted windows": ("--world_model.augmentation.max_shift", "0"),
+    **SAME_WINDOWS,
+    "no augmentation": sum(SAME_WINDOWS.values(), ()),
     "latent loss times 10": ("--world_model.beta_z", "1"),
     "latent loss by 10": ("--world_model.beta_z", "0.01"),
 }

@@ -79,7 +79,8 @@ def record_dataset(
         ) from error
     except ChildProcessError as error:
         raise OSError(
-            f"a worker died while recording {root}; repeat the call with fewer workers, finished episodes are kept"
+            f"a worker died while recording {root}; repeat the call with fewer workers, finished episodes are kept (a "
+            'script must call it below if __name__ == "__main__")'
         ) from error
     except OSError as error:
         raise OSError(
