@@ -20,7 +20,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynmap_rl.utils.cli import command_line, run_recipe
+from dynmap_rl.utils.cli import command_line, refuse, run_recipe
 
 
 @dataclass(frozen=True)
@@ -72,6 +72,8 @@ def main(config: Config) -> None:
     torch.set_num_threads(1)  # networks are small, and threads would wait for each other
     run = find_run(config.policy) if config.policy else None
     task = config.task or (run and task_of_run(run)) or "balance_reaching"
+    if not run:
+        refuse(config, Config(), ["seed"], "no --policy")
     actor = load_actor(run, config.seed) if run else None
     layout = get_task(task, from_file=not config.task).layout
     if config.size < 64 or (config.steps is not None and config.steps < 1):

@@ -26,7 +26,7 @@ class Config:
 
     # Runs with world models, with commas between: folders, hub ids, or balance_reaching (shipped).
     runs: str = "runs/decoupled/balance_reaching/position_velocity_recurrent"
-    # Dataset of balance_reaching: a folder or a hub id; by default datasets/balance_reaching, recorded if missing.
+    # Dataset of the runs' task: a folder or a hub id; by default datasets/TASK, recorded where it is missing.
     dataset: str | None = None
     # Folder for decoded datasets; by default DATASET.cache beside the dataset.
     cache: Path | None = None
@@ -48,7 +48,7 @@ class Config:
 def main(config: Config) -> None:
     """Measure, draw and report."""
     from dynmap_rl.data.demonstrations import load_dataset, load_meta
-    from dynmap_rl.envs.scene import Scene
+    from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.evaluation.open_loop import decodes_poses, open_loop_errors
     from dynmap_rl.evaluation.perception import begin_scenes, color_errors, locate_cart
     from dynmap_rl.evaluation.probing import judge_states, probe
@@ -59,8 +59,8 @@ def main(config: Config) -> None:
     from dynmap_rl.utils.files import write_json
     from dynmap_rl.utils.version import find_commit
 
-    models = load_world_models(config.runs.split(","))
-    dataset = find_or_record("balance_reaching", config.dataset)
+    models, task = load_world_models(config.runs.split(","))
+    dataset = find_or_record(task, config.dataset)
     train = load_dataset(dataset, "train", config.cache)[: config.train_episodes]
     test = load_dataset(dataset, "eval", config.cache)[: config.test_episodes]
     if "labelled" in test.keys():
@@ -74,9 +74,10 @@ def main(config: Config) -> None:
     }
     probes = {name: probe(model, train, test) for name, model in models.items()}
     rows = [row for row in load_meta(dataset)["episodes"] if row["split"] == "eval"][: len(test)]
+    read_scene = get_task(task).ranges.scene.from_dict
     judged = {
-        "held-out demonstrations": (test, [Scene.from_dict(row["scene"]) for row in rows]),
-        "first ten steps": begin_scenes("balance_reaching", len(test)),
+        "held-out demonstrations": (test, [read_scene(row["scene"]) for row in rows]),
+        "first ten steps": begin_scenes(task, len(test)),
     }
     perception = {
         name: {
@@ -108,30 +109,35 @@ def main(config: Config) -> None:
     print(f"written: {config.output}")
 
 
-def load_world_models(runs: list[str]) -> dict:
-    """Load the world models of runs, by the names of their rows and, where those are equal, of the runs."""
+def load_world_models(runs: list[str]) -> tuple[dict, str]:
+    """Load the world models of runs, by the names of their rows and, where those are equal, of the runs; and their task."""
     from collections import Counter
 
     from dynmap_rl.envs.world import ACTION_LIMIT
     from dynmap_rl.modules.supervision import row_name
     from dynmap_rl.runs.lookup import load_world_model_of
 
-    models = {}
+    models, tasks = {}, {}
     for run in dict.fromkeys(run.strip().rstrip("/") for run in runs):
         world_model, origin = load_world_model_of(run)
         if "task" not in origin or world_model.transition.action.size != len(ACTION_LIMIT):
             raise ValueError(
                 f"--runs must be of tasks 1 to 3, got {run}; recipes/robot.py judges its world models itself"
             )
+        tasks.setdefault(origin["task"], run)
         row = f"{row_name(world_model.supervision, origin['training'])}, {origin['training']}"
         if world_model.architecture != "glimpse":
             row += f", {world_model.architecture}"
         models[row, run] = world_model
+    if len(tasks) > 1:
+        found = ", ".join(f"{run} of {task}" for task, run in tasks.items())
+        raise ValueError(f"--runs must have world models of one task, got {found}; probe each task by itself")
     rows, names = Counter(row for row, _ in models), Counter(Path(run).name for _, run in models)
-    return {
+    named = {
         row if rows[row] == 1 else f"{row}, {Path(run).name if names[Path(run).name] == 1 else run}": model
         for (row, run), model in models.items()
     }
+    return named, next(iter(tasks))
 
 
 def describe(open_loop: dict, probes: dict, perception: dict, verdicts: dict, seconds: float) -> str:

@@ -156,7 +156,7 @@ def describe_pieces(data: dict) -> str:
     if data["left_out"]:
         text += f"; left out, as too short: {', '.join(map(str, data['left_out']))}"
     if data["info"].get("total_tasks", 1) > 1 and not data["goal"]:
-        text += "\nthe dataset has several tasks, which a policy without --goal cannot tell apart"
+        text += "\nthe dataset has several tasks, which a policy tells apart by --goal alone, such as task_index:0"
     return text
 
 

@@ -158,12 +158,12 @@ def _name_episodes(episodes: list[int]) -> str:
     return f"episode{'s' * (len(episodes) > 1)} {', '.join(map(str, episodes))}"
 
 
-def measure(frames: np.ndarray, factor: float, camera: FrameSource, fps: float) -> Motion:
+def measure(frames: np.ndarray, factor: Sequence[float], camera: FrameSource, fps: float) -> Motion:
     """Measure the motion in one episode.
 
     Args:
         frames: uint8 ``[T, height, width, 3]``.
-        factor: ratio of the full width to that of the frames.
+        factor: ratios of the full width and height to those of the frames, ``[2]``.
         camera: source and its settings.
         fps: frames per second.
 
@@ -188,11 +188,12 @@ def track(frames: np.ndarray, camera: FrameSource) -> Tracks:
     return track_objects(frames, camera.objects, camera.threshold, camera.sort, camera.colors)
 
 
-def _scale(height: int, width: int, factor: float, metres: float | None, size: int):
+def _scale(height: int, width: int, factor: Sequence[float], metres: float | None, size: int):
     """Return the map from pixels of reduced frames to positions, and the factors of differences."""
     middle = np.array([0.5, 0.5, 0.0])[:size]  # of a pixel
-    scale, origin = np.array([factor, factor, 1.0])[:size], -middle
+    scale, origin = np.array([*factor, 1.0])[:size], -middle
     if metres is not None:
-        scale = np.array([metres / width, -metres / width, -1.0])[:size]
-        origin = np.array([0.0, metres * height / width, 0.0])[:size]
+        pixel = metres / (width * factor[0])  # of the full frame
+        scale, origin = scale * np.array([pixel, -pixel, -1.0])[:size], np.zeros(size)
+        origin[1] = pixel * height * factor[1]
     return lambda pose: (pose + middle) * scale + origin, scale

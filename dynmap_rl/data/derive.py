@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 from collections.abc import Iterable, Sequence
@@ -23,6 +24,7 @@ from .quality import Derived, judge_quality
 from .state import choose_state, read_state
 
 METHODS = ("central", "savgol")
+ELONGATED = 1.3  # length to width of an object whose longest axis is known
 SOURCES = "state", "centroid", "tracks", "flow", "state,tracks", "state,flow"
 
 
@@ -171,7 +173,7 @@ def add_dynamics(
     values, derived, start = {q: np.empty((len(table), len(names))) for q in DYNAMICS}, [], 0
     seen = np.ones((len(table), len(names)), dtype=bool)
     for own_names, motions, own_method in parts:
-        own = slice(start, start := start + len(own_names))
+        own, first = slice(start, start := start + len(own_names)), len(derived)
         for episode, motion in motions:
             try:
                 found, motion = _derive(motion, time[rows[episode]], own_method, window, order)
@@ -182,19 +184,23 @@ def add_dynamics(
             if motion.found is not None:
                 seen[rows[episode], own] = motion.found.repeat(len(own_names) // motion.found.shape[1], 1)
             derived.append(Derived(episode, own_names, found["position"], found["velocity"], motion))
-            angles = motion.angles
-        for entry in angles:
-            align_turns(values["position"][:, own][:, entry], list(rows.values()), motion.period)
+        angle = values["position"][:, own][:, motion.angles]
+        if motion.tracks:
+            align_axes(angle, [(rows[part.episode], part.motion) for part in derived[first:]])
+        else:
+            align_turns(angle, list(rows.values()), motion.period)
+        values["position"][:, own][:, motion.angles] = angle
     new = {f"dynamics.{q}": v.astype(np.float32) for q, v in values.items()}
     if view or FOUND in info["features"]:
         new[FOUND] = seen
     meta = _describe(meta, planar, names, values, rows) if meta else None
-    there = {
-        q: read_column(root, info, table, f"dynamics.{q}", np.float64).numpy()
-        for q in DYNAMICS
-        if f"dynamics.{q}" in old
-    }
-    differences = {q: np.abs(values[q] - v).mean(0) for q, v in there.items() if v.shape == values[q].shape}
+    differences = {}
+    for name in old:
+        quantity = name.removeprefix("dynamics.")
+        with contextlib.suppress(ValueError):  # damaged columns may be replaced too
+            before = read_column(root, info, table, name, np.float64).numpy()
+            if before.shape == values[quantity].shape:
+                differences[quantity] = np.abs(values[quantity] - before).mean(0)
     quality = judge_quality(derived)
     how = {"source": source, "methods": [part[2] for part in parts], "window": window, "order": order}
     how |= {"state": entries and dataclasses.asdict(entries), "frames": view and dataclasses.asdict(view)}
@@ -218,13 +224,37 @@ def _derive(
 
 
 def align_turns(angle: np.ndarray, rows: list[slice], period: float) -> None:
-    """Shift episodes of an unwrapped angle ``[N]`` in place by whole turns, so that a pose has one value in all of them.
+    """Shift episodes of unwrapped angles ``[N, D]`` in place by whole turns, so that a pose has one value in all of them.
 
     The mean of each episode is moved to within half a turn of the mean direction of all.
     """
-    center = np.angle(np.exp(2j * np.pi * angle / period).mean()) * period / (2 * np.pi)
+    center = _direction(angle, period)
     for own in rows:
-        angle[own] -= period * np.round((angle[own].mean() - center) / period)
+        angle[own] -= period * np.round((angle[own].mean(0) - center) / period)
+
+
+def align_axes(angle: np.ndarray, episodes: list[tuple[slice, Motion]]) -> None:
+    """Shift episodes of the angles of tracked objects ``[N, objects]`` in place, so that a pose has one value in all of them.
+
+    The longest axis of an object has no direction. Its angle is counted from the horizontal or the vertical of the picture,
+    whichever is nearer at the start of most episodes, and begins within a quarter of a turn of it; within an eighth for an
+    object that is less than :data:`ELONGATED` times as long as wide.
+    """
+    for n, column in enumerate(angle.T):
+        found = [np.flatnonzero(motion.found[:, n])[:5] for _, motion in episodes]
+        start = np.array(
+            [np.median(column[own][seen]) for (own, _), seen in zip(episodes, found, strict=True)]
+        )
+        long = np.median([motion.tracks.elongation[n] for _, motion in episodes]) > ELONGATED
+        period = np.pi if long else np.pi / 2
+        axis = np.pi / 2 * np.round(_direction(start, period) / (np.pi / 2))
+        for (own, _), first in zip(episodes, start, strict=True):
+            column[own] -= axis + period * np.round((first - axis) / period)
+
+
+def _direction(angle: np.ndarray, period: float) -> np.ndarray:
+    """Return the mean direction of angles over the first dimension."""
+    return np.angle(np.exp(2j * np.pi * angle / period).mean(0)) * period / (2 * np.pi)
 
 
 def _check_lengths(root: Path, rows: dict[int, slice], methods: list[str], window: int) -> None:

@@ -45,15 +45,17 @@ LIMITS = {
     "jumps": (
         0.005, True, "share of the steps in which a position jumps by more than a quarter of its extent",
         "look at the frames there: the track has gone to another object, or the sensor failed; name an angle of a state that "
-        "jumps by its period in --angles",
+        "jumps by its period in --angles, and leave an entry that hardly moves out of --columns",
     ),
     "residual": (
         0.02, True, "distance from a smooth trajectory, root mean square, as a share of the extent of the motion",
-        "use --method savgol with a longer --window; a position is noisy, or the picture too coarse",
+        "film from nearer, or leave an entry that hardly moves out of --columns; positions stay as measured, and only velocities "
+        "gain by --method savgol with a longer --window",
     ),
     "residual_angle": (
         0.07, True, "distance of an angle from a smooth trajectory, root mean square (rad)",
-        "use --method savgol with a longer --window, or --point true for tracks without angles: a round object has none",
+        "film from nearer, or use --point true for tracks without angles, which a round object has none of; only velocities "
+        "gain by --method savgol with a longer --window",
     ),
     "agreement": (
         0.7, False, "correlation of the tracks' velocity with that of the optical flow",

@@ -16,7 +16,7 @@ from dynmap_rl.keys import DYNAMICS, FOUND
 from dynmap_rl.utils.settings import parse_numbers
 
 from .format.frames import choose_camera, iterate_frames
-from .format.reading import choose_splits, find_dataset, read_column, read_info, read_table, spans
+from .format.reading import choose_splits, find_dataset, is_vector, read_column, read_info, read_table, spans
 from .normalization import range_constants
 from .state import entry_names
 
@@ -145,7 +145,7 @@ def _read_numbers(layout: dict) -> tuple[dict, dict[int, slice]]:
     goal, entries = layout["goal"] or ("action", [])
     table = read_table(root, info, list({*columns.values(), goal}))
     numbers = {key: read_column(root, info, table, name) for key, name in (columns | {"goal": goal}).items()}
-    numbers["goal"] = numbers["goal"][:, entries]
+    numbers["goal"] = numbers["goal"][:, entries].float()
     return numbers, dict(spans(table["episode_index"].to_numpy()))
 
 
@@ -155,7 +155,7 @@ def _check_goal(root: Path, info: dict, goal: str | None) -> tuple[str, list[int
     column, _, text = goal.rpartition(":")
     entries = parse_numbers(text, "--goal: entries after the colon")
     feature = info["features"].get(column)
-    if feature is None or feature["dtype"] not in ("float32", "float64") or len(feature["shape"]) != 1:
+    if feature is None or not is_vector(feature):
         raise ValueError(
             f"--goal must be a column of numbers and its entries, such as observation.state:3,4, got {goal!r}"
         )

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .format.reading import read_column, read_table, spans
+from .format.reading import is_vector, read_column, read_table, spans
 from .motion import Motion
 
 
@@ -67,8 +67,7 @@ def choose_state(
         raise ValueError(f"--noise and --angle_noise must be at least 0, got {noise} and {angle_noise}")
     if not 0 < period < math.inf:
         raise ValueError(f"--period must be above 0, got {period}")
-    numbers = ("float32", "float64")
-    vectors = [n for n, f in info["features"].items() if f["dtype"] in numbers and len(f["shape"]) == 1]
+    vectors = [name for name, f in info["features"].items() if is_vector(f) and f["dtype"] != "bool"]
     if column not in vectors:
         raise ValueError(f"--state must be a column of numbers, one of {', '.join(vectors)}, got {column!r}")
     size = info["features"][column]["shape"][0]
@@ -93,7 +92,7 @@ def read_state(root: Path, info: dict, state: StateSource) -> Iterator[tuple[int
         ValueError: a file is damaged.
     """
     table = read_table(root, info, [state.column])
-    position = read_column(root, info, table, state.column, np.float64).numpy()[:, state.columns]
+    position = read_column(root, info, table, state.column, np.float64, state.columns).numpy()
     spans_of = np.ptp(position[:, state.angles], axis=0)
     for entry, extent in zip(state.angles, spans_of, strict=True):
         if extent > 1.05 * state.period:

@@ -33,6 +33,7 @@ class Tracks:
         area: pixels of the object, ``[T, N]``; 0 where it is not found.
         cut: bool ``[T, N]``, whether the object touches the border of the picture.
         labels: uint8 ``[T, height, width]``, number of the object of a pixel from 1 on, 0 elsewhere.
+        elongation: ratio of the axes of each object, ``[N]``, the median over the frames.
         moving: share of the pixels that ever differ from the background.
     """
 
@@ -41,6 +42,7 @@ class Tracks:
     area: np.ndarray
     cut: np.ndarray
     labels: np.ndarray
+    elongation: np.ndarray
     moving: float
 
 
@@ -99,8 +101,8 @@ def track_objects(
     Regions in which nothing moves in the episode are left out, unless the object has no other. Other things may move too,
     such as an arm.
 
-    The angle is that of the longest axis, or of the shortest one if that is nearer to the horizontal in the first frame. It
-    means little for an object as wide as tall.
+    The angle is that of the longest axis, which has no direction: it begins within a quarter of a turn of 0 in every
+    episode. It means little for an object as wide as tall.
 
     Args:
         frames: frames of one episode, uint8 ``[T, height, width, 3]``.
@@ -139,6 +141,10 @@ def track_objects(
             f"got {threshold}"
         )
     pose = np.array([[region[0] for region in row] for row in regions])
+    elongation = np.array([[region[3] for region in row] for row in regions])
+    elongation = np.array(
+        [np.median(column[seen]) for column, seen in zip(elongation.T, found.T, strict=True)]
+    )
     cut = np.array([[region[2] for region in row] for row in regions]) & found
     for n in range(objects):
         pose[:, n, 2] = _straighten(pose[:, n, 2], found[:, n])
@@ -152,6 +158,7 @@ def track_objects(
         (area * found)[:, order],
         cut[:, order],
         numbers[labels],
+        elongation[order],
         float(ever.mean()),
     )
 
@@ -247,27 +254,28 @@ def _faintest(area: np.ndarray) -> float:
     return max(4.0, FAINTEST * float(np.median(area[area > 0]))) if area.any() else np.inf
 
 
-def _measure(labels: np.ndarray, n: int) -> tuple[tuple[float, float, float], int, bool]:
-    """Return pose (pixels, rad), area and contact with the border of object n's largest region; clear its others."""
+def _measure(labels: np.ndarray, n: int) -> tuple[tuple[float, float, float], int, bool, float]:
+    """Return pose (pixels, rad), area, contact with the border and elongation of object n's largest region; clear others."""
     mask = labels == n
     count, regions, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     if count == 1:
-        return (0.0, 0.0, 0.0), 0, False
+        return (0.0, 0.0, 0.0), 0, False, 1.0
     largest = 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
     labels[mask & (regions != largest)] = 0
     moments = cv2.moments((regions == largest).astype(np.uint8), binaryImage=True)
     x, y = moments["m10"] / moments["m00"], moments["m01"] / moments["m00"]
-    angle = 0.5 * np.arctan2(2 * moments["mu11"], moments["mu20"] - moments["mu02"])
+    both, apart = moments["mu20"] + moments["mu02"], moments["mu20"] - moments["mu02"]
+    angle, apart = 0.5 * np.arctan2(2 * moments["mu11"], apart), np.hypot(2 * moments["mu11"], apart)
     left, top, width, height, area = stats[largest]
     cut = left == 0 or top == 0 or left + width == mask.shape[1] or top + height == mask.shape[0]
-    return (x, y, angle), int(area), bool(cut)
+    return (x, y, angle), int(area), bool(cut), float(np.sqrt((both + apart) / max(both - apart, 1e-9)))
 
 
 def _straighten(angle: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """Unwrap angles of an axis, which has no direction, and begin within an eighth of a turn of 0."""
+    """Unwrap angles of an axis, which has no direction, and begin within a quarter of a turn of 0."""
     angle = angle.copy()
     angle[found] = np.unwrap(angle[found], period=np.pi)
-    return angle - np.pi / 2 * np.round(np.median(angle[found][:5]) / (np.pi / 2))
+    return angle - np.pi * np.round(np.median(angle[found][:5]) / np.pi)
 
 
 def _order(sort: str, pose, area, found, frames, labels) -> list[int]:

@@ -27,7 +27,7 @@ class Layout:
         robot: what the actions move, as datasets name it.
 
     Raises:
-        ValueError: ``state`` does not end with the goal.
+        ValueError: ``state`` does not end with the goal, or ``action`` and ``action_limit`` have different lengths.
     """
 
     steps: int
@@ -45,6 +45,8 @@ class Layout:
         goal = [name for name in self.state if name.startswith("goal_")]
         if not goal or list(self.state[-len(goal) :]) != goal:
             raise ValueError(f"state must end with the entries of the goal, named goal_..., got {self.state}")
+        if len(self.action) != len(self.action_limit):
+            raise ValueError(f"action_limit must have {len(self.action)} entries, got {self.action_limit}")
 
     @property
     def dt(self) -> float:
@@ -122,7 +124,6 @@ class BaseTask(ABC):
         symmetric: whether a demonstration that is mirrored left to right, or shifted, is a demonstration of the task.
         planar: whether frames are flat pictures of the plane that recolouring, mirroring and shifting keep in agreement
             with the dynamics. World models of other tasks are trained without augmentation.
-        pushes: number of pushes in a disturbed demonstration.
         max_worlds: number of worlds that fit into memory at a time; None for any number.
         state_size: number of entries S of ``state``.
     """
@@ -130,7 +131,6 @@ class BaseTask(ABC):
     ranges: Any = None
     symmetric: bool = False
     planar: bool = False
-    pushes: int = 0
     max_worlds: int | None = None
 
     @property
@@ -165,7 +165,11 @@ class BaseTask(ABC):
 
     @abstractmethod
     def step(self, worlds: Sequence[Any], actions: np.ndarray | Sequence[np.ndarray]) -> None:
-        """Simulate one control step of every world with its action ``[A]``."""
+        """Simulate one control step of every world with its action ``[A]``.
+
+        The actions of a task of another simulator than cart and block lie within ``layout.action_limit``: environments and
+        recordings cut them.
+        """
 
     @abstractmethod
     def make_renderer(self) -> Callable[[Any], np.ndarray]:
@@ -221,3 +225,33 @@ class BaseTask(ABC):
     def has_demonstrator(self) -> bool:
         """Whether the task has a demonstrator."""
         return type(self).demonstrator is not BaseTask.demonstrator
+
+
+def check_world(
+    task: BaseTask, world: SimulatedWorld, frame: np.ndarray | None = None, state: bool = True
+) -> None:
+    """Check the sizes of what a task returns against its layout.
+
+    Args:
+        task: the task.
+        world: one of its worlds, at the start of an episode.
+        frame: what the task's renderer has drawn.
+        state: whether the state is checked too.
+
+    Raises:
+        ValueError: a size differs, or the frame is not uint8.
+    """
+    layout, (channels, height, width) = task.layout, task.layout.frame_shape
+    found = {"agent_pos": (task.agent_pos(world), (len(layout.state),))}
+    found |= {name: (getattr(world, name), (len(entries),)) for name, entries in layout.dynamics.items()}
+    if state:
+        found["state"] = task.state(world), (task.state_size,)
+    if frame is not None:
+        found["frame"] = frame, (height, width, channels)
+    for name, (value, shape) in found.items():
+        if np.shape(value) != shape:
+            raise ValueError(
+                f"{name} of the task {task.name} must have the shape {shape}, got {np.shape(value)}"
+            )
+    if frame is not None and frame.dtype != np.uint8:
+        raise ValueError(f"the frames of the task {task.name} must be uint8, got {frame.dtype}")

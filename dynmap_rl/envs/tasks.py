@@ -268,7 +268,12 @@ def _make_task(name: str, from_file: bool) -> BaseTask:
     except (TypeError, ValueError) as error:
         raise ValueError(f"the arguments of the task {name!r} are wrong ({error})") from error
     if rest:
-        made.name = re.sub("[^a-z0-9]+", "_", f"{made.name}_{rest[0].lower()}")
+        try:
+            made.name = re.sub("[^a-z0-9]+", "_", f"{made.name}_{rest[0].lower()}")
+        except AttributeError as error:
+            raise ValueError(
+                f"name of the task {name!r} must be a class attribute, got a property"
+            ) from error
     return made
 
 

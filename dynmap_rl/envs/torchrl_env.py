@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 from dynmap_rl.keys import DYNAMICS
 
 from .gym_env import ACTION_LIMITS
-from .protocol import BaseTask, SimulatedWorld
+from .protocol import BaseTask, SimulatedWorld, check_world
 from .scene import SceneRanges, choose_ranges
 from .task import Task
 from .tasks import get_task
@@ -85,6 +85,7 @@ class DynmapBatchedEnv(EnvBase):
         self.draw = self.task.make_renderer() if from_pixels else None
         self.include_state = include_state
         self.worlds: list[SimulatedWorld | None] = [None] * num_envs
+        self._checked = False
         self._make_specs()
         self.set_seed(seed)
 
@@ -148,6 +149,12 @@ class DynmapBatchedEnv(EnvBase):
         for i in rows:
             seed = int(seeds[i]) if seeds is not None else int(self.rng.integers(2**63))
             self.worlds[i] = self.task.begin(seed, self.ranges, self.worlds[i])
+        if rows and not self._checked:
+            world = self.worlds[rows[0]]
+            check_world(
+                self.task, world, np.array(self.draw(world)) if self.draw else None, self.include_state
+            )
+            self._checked = True
         # Callers may change what they get, so the last observation is kept apart.
         if len(rows) == n:
             self._observation = self._observe(self.worlds)
@@ -159,7 +166,10 @@ class DynmapBatchedEnv(EnvBase):
         if None in self.worlds:
             raise RuntimeError("the environment has not begun; call reset first")
         actions = tensordict["action"].detach().cpu().numpy()
-        if self.control == "acceleration":
+        if not isinstance(self.task, Task):
+            limit = np.array(self.layout.action_limit, np.float32)
+            actions = actions.clip(-limit, limit)
+        elif self.control == "acceleration":
             actions = [world.action_for(a) for world, a in zip(self.worlds, actions, strict=True)]
         self.task.step(self.worlds, actions)
         self._observation = self._observe(self.worlds)

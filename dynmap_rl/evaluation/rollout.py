@@ -16,8 +16,11 @@ from tqdm import tqdm
 from dynmap_rl.data.recording.plans import Plan, draw_pushes, push
 from dynmap_rl.envs.delay import FrameDelay
 from dynmap_rl.envs.delay_transform import DelayTransform
+from dynmap_rl.envs.protocol import BaseTask
+from dynmap_rl.envs.task import Task
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
+from dynmap_rl.modules.actor import Actor
 from dynmap_rl.modules.delayed_actor import DelayedActor
 
 from .still import reuse_still_frames
@@ -48,28 +51,52 @@ def roll_out(
         delay: delay of the frames, which are the same for the same scenes. A :class:`dynmap_rl.modules.DelayedActor`
             gets every frame that arrives; any other actor gets the newest that has arrived.
         pushed: execute pushes in the place of some actions, which the actor is not told. They are as many and as strong
-            as in disturbed demonstrations, and the same for the same scenes.
+            as in disturbed demonstrations, and the same for the same scenes. Needs a task of cart and block.
         progress: show a progress bar.
 
     Returns:
         A TensorDict ``[E, T]`` with ``action``, ``goal`` and ``dynamics`` at t, ``pixels`` if they are kept, and
         ``("next", "position_error" | "dropped" | "touched" | "is_success")``. ``("predicted_dynamics", quantity)`` is the
         one-step prediction of the actor's world model at t, zero at t = 0, for each quantity that it decodes.
+
+    Raises:
+        ValueError: the actor is of other sizes than the task, or the task knows no pushes.
     """
     module = actor if isinstance(actor, nn.Module) else nn.Module()
     seeds, rules, device = [int(seed) for seed in seeds], get_task(task), find_device(actor)
+    check_actor(actor, rules)
+    if pushed and not isinstance(rules, Task):
+        raise ValueError(f"pushed needs a task of cart and block, got {task}")
+    pushes = rules.pushes if pushed else 0
     size = min(len(seeds), rules.max_worlds or len(seeds))
     env = DynmapBatchedEnv(task, size, from_pixels=True, include_state=False, device=device)
     parts, title = [], f"{len(seeds)} episodes" if progress else None
     for start in range(0, len(seeds), size):
         some = seeds[start : start + size]
         full = some + seeds[: size - len(some)]  # a batch always has the same size
-        plans = [Plan(seed, "", pushes=draw_pushes(seed, rules.pushes * pushed)) for seed in full]
+        plans = [Plan(seed, "", pushes=draw_pushes(seed, pushes)) for seed in full]
         still = reuse_still_frames(module) if device.type == "cpu" else nullcontext()
         with evaluation_mode(module), still:
             episodes = _roll_out(actor, env, plans, keep_pixels, delay, title)
         parts.append(episodes[: len(some)])
     return torch.cat(parts)
+
+
+def check_actor(actor: Callable, task: BaseTask) -> None:
+    """Raise ``ValueError`` where the world model and policy of an actor have other sizes than the task's layout."""
+    if not isinstance(actor, Actor | DelayedActor):
+        return
+    world_model, layout = actor.world_model, task.layout
+    policy = (actor.actor if isinstance(actor, DelayedActor) else actor).latent_actor.policy
+    own = {
+        "action": (world_model.transition.action.size, len(layout.action)),
+        "goal": (policy.goal.size, layout.goal_size),
+        "frame side": (world_model.image_size, layout.image_size),
+        "cameras": (world_model.cameras, len(layout.cameras)),
+    }
+    wrong = [f"{name} {found} instead of {size}" for name, (found, size) in own.items() if found != size]
+    if wrong:
+        raise ValueError(f"the policy must be of {task.name}, got another one: {', '.join(wrong)}")
 
 
 @contextmanager
@@ -158,9 +185,11 @@ def episode_rows(episodes: TensorDict, seeds: list[int]) -> list[dict]:
         for i, seed in enumerate(seeds)
     ]
     truth, predicted = (episodes[key].get("position", None) for key in ("dynamics", "predicted_dynamics"))
-    if predicted is not None and predicted.shape == truth.shape:  # a world model may know other entries
+    axes = episodes["goal"].shape[-1]  # the goal is a point in the plane or in space
+    if (
+        predicted is not None and predicted.shape == truth.shape and axes in (2, 3)
+    ):  # it may know other entries
         error = predicted - truth
-        axes = episodes["goal"].shape[-1]  # the goal is a point in the plane or in space
         error = error[:, 1:, :axes].norm(dim=-1)  # [E, T - 1]
         away = (truth[..., :axes] - episodes["goal"])[:, 1:].norm(dim=-1) > 0.1
         away_error = (error * away).sum(1) / away.sum(1)

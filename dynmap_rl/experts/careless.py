@@ -7,6 +7,7 @@ import math
 import torch
 from torch import nn
 
+from dynmap_rl.envs.protocol import BaseTask
 from dynmap_rl.envs.scene import BinScene
 from dynmap_rl.envs.task import Task
 from dynmap_rl.envs.world import ACCELERATION_LIMIT, CONTROL_DT, VELOCITY_LIMIT
@@ -23,10 +24,15 @@ class CarelessController(nn.Module):
 
     Args:
         task: task that it plays, whose state it reads.
+
+    Raises:
+        ValueError: the task is not one of cart and block.
     """
 
-    def __init__(self, task: Task):
+    def __init__(self, task: BaseTask):
         super().__init__()
+        if not isinstance(task, Task):
+            raise ValueError(f"the careless controller plays tasks of cart and block, got {task.name}")
         self.tips = issubclass(task.ranges.scene, BinScene)
         self.register_buffer("limit", torch.as_tensor(ACCELERATION_LIMIT, dtype=torch.float32))
         self.register_buffer("speed", torch.as_tensor(VELOCITY_LIMIT, dtype=torch.float32))

@@ -143,7 +143,7 @@ def task_of_expert(expert: str | Path, task: Task) -> Task:
     """
     facts = read_json(find_expert(expert) / f"{list_checkpoints(expert)[-1]}.json", {"task": str})
     trained_on = get_task(facts["task"], from_file=True)
-    if not issubclass(task.ranges.scene, trained_on.ranges.scene):
+    if not isinstance(task, Task) or not issubclass(task.ranges.scene, trained_on.ranges.scene):
         raise ValueError(
             f"the expert {expert} reads states of {trained_on.name}, which {task.name} does not have; choose another "
             "--expert"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections import deque
 
 import numpy as np
@@ -27,7 +28,7 @@ class RobotActor:
     The episode begins with the first call of :meth:`act`, which needs a frame. The robot is at rest before it, so that
     the newest frame then counts as the frame of that moment. Every later frame belongs to the call of :meth:`act` that is
     nearest to its timestamp, and of several frames that arrive together for a call, the nearest is used; frames older
-    than ``max_delay`` steps are not used.
+    than ``max_delay`` steps are not used, and after ``max_delay`` of them in a row there is a warning: two clocks may differ.
 
     A call may be late by up to three quarters of a period. Where it is later, control steps were missed, which count as
     steps with an action of zero, or with the last one again (``hold``); after a longer gap than ``max_delay`` steps, the
@@ -60,8 +61,15 @@ class RobotActor:
         Args:
             goal: ``[G]`` (SI units).
             since: time from which on frames are of the new episode; frames that were taken before it are not used.
+
+        Raises:
+            ValueError: the goal has another size than the policy's, or is not finite.
         """
-        self.goal = torch.as_tensor(goal, dtype=torch.float32, device=self.device)
+        goal = torch.as_tensor(goal, dtype=torch.float32, device=self.device)
+        size = self.actor.actor.latent_actor.policy.goal.size
+        if goal.shape != (size,) or not goal.isfinite().all():
+            raise ValueError(f"goal must be {size} finite numbers, got {goal.tolist()}")
+        self.goal, self.unused = goal, 0
         self.since, self.memory = since, TensorDict({}, device=self.device)
         self.frames: list[tuple[float, np.ndarray]] = []
         self.times: deque[float] = deque(maxlen=self.actor.max_delay + 1)  # of the last steps
@@ -86,10 +94,15 @@ class RobotActor:
         """Return the action of the control step that begins now, float32 ``[A]`` (SI units).
 
         Raises:
-            ValueError: no frame has arrived before the first action, ``now`` is not after the last call, or :meth:`reset`
-                was not called.
+            ValueError: no frame has arrived before the first action, ``now`` is not after the last call, a frame was taken
+                more than a period after ``now``, or :meth:`reset` was not called.
         """
         self._check_reset()
+        if (newest := max((time for time, _ in self.frames), default=now)) > now + self.period:
+            self.frames = []
+            raise ValueError(
+                f"a frame of {newest} cannot have arrived at {now}; observe and act need one clock"
+            )
         if self.times and not now > self.times[-1]:
             raise ValueError(f"now must be after the last call at {self.times[-1]}, got {now}")
         if self.times:
@@ -117,6 +130,12 @@ class RobotActor:
             delay, distance = self._delay(timestamp)
             if delay not in nearest or distance < nearest[delay][0]:
                 nearest[delay] = distance, frame
+        self.unused = 0 if any(delay >= 0 for delay in nearest) else self.unused + len(frames)
+        if self.unused >= self.actor.max_delay > self.unused - len(frames):
+            warnings.warn(
+                f"the last {self.unused} frames were too old to be used; do observe and act use one clock?",
+                stacklevel=3,
+            )
         if nearest:
             pixels = torch.from_numpy(np.stack([frame for _, frame in nearest.values()])).movedim(-1, -3)
             td.set(keys.pixels, pixels).set(self.actor.delay_key, torch.tensor([*nearest]))

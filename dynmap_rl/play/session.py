@@ -15,6 +15,7 @@ from dynmap_rl.envs.scene import scene_seed
 from dynmap_rl.envs.task import Task
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.envs.world import ACTION_LIMIT, CONTROL_DT
+from dynmap_rl.evaluation.rollout import check_actor
 from dynmap_rl.experts.network import load_expert, task_of_expert
 from dynmap_rl.keys import DYNAMICS
 from dynmap_rl.modules.actor import Actor
@@ -96,11 +97,17 @@ class Session:
         self.task: BaseTask = self.env.task
         self.expert, self.expert_task = _find_expert(self.task, expert or task, named=expert is not None)
         self.driver, self.person = "policy" if actor else "person", Person()
+        if actor:
+            check_actor(actor, self.task)
+        self.delay = -1
         self.set_delay(delay)
 
     def set_delay(self, delay: int) -> None:
         """Change the age of the frames that the actor gets, 0 to 20 control steps, and begin the scene again."""
-        self.delay = min(max(delay, 0), MAX_DELAY)
+        delay = min(max(delay, 0), MAX_DELAY)
+        if delay == self.delay:
+            return
+        self.delay = delay
         self._follower = DelayedActor(self.actor, self.delay) if self.actor and self.delay else self.actor
         self.restart(self.seed)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 
 import numpy as np
 
@@ -48,7 +49,7 @@ class PlayWindow:
     def __init__(self, session: Session, size: int = 384):
         self.session, self.size = session, size
         self.dt, self.flat = session.env.layout.dt, isinstance(session.task, Task)
-        self.bodies = list(dict.fromkeys(name.partition("_")[0] for name in session.env.layout.velocity))
+        self.bodies = list(dict.fromkeys(map(_name_body, session.env.layout.velocity)))
         self.body = self.bodies[-1] if self.flat else self.bodies[0]  # the object that is moved
         self.paused, self.open = False, True
         self.held: set[str] = set()
@@ -106,7 +107,7 @@ class PlayWindow:
             self.body = self.bodies[(self.bodies.index(self.body) + 1) % len(self.bodies)]
         elif key == "i" and session.actor:
             session.imagining = not session.imagining
-        elif key in ("page up", "page down"):
+        elif key in ("page up", "page down") and session.actor:
             session.set_delay(session.delay + (1 if key == "page up" else -1))
         elif key == "tab":
             drivers = session.drivers
@@ -138,7 +139,11 @@ class PlayWindow:
         self._write(self._status(), MARGIN, 2 * MARGIN + LINE + size)
         for row, quantity in enumerate(DYNAMICS):
             names = session.env.layout.dynamics[quantity]
-            entries = [i for i, name in enumerate(names) if name.partition("_")[0] == self.body]
+            owners = [
+                max((b for b in self.bodies if f"{n}_".startswith(f"{b}_")), key=len, default="")
+                for n in names
+            ]
+            entries = [i for i, owner in enumerate(owners) if owner == self.body]
             for column, entry in enumerate(entries[:3]):
                 self._trace(quantity, entry, column, row)
         pygame.display.flip()
@@ -212,3 +217,8 @@ def _limits(values: np.ndarray, least: float) -> tuple[float, float]:
     """Return the lower and the upper end of a trace that holds all values and has at least a height."""
     middle, half = (values.max() + values.min()) / 2, max(np.ptp(values), least) / 2
     return middle - half, middle + half
+
+
+def _name_body(entry: str) -> str:
+    """Return the body of an entry of the velocity, such as ``left_hand`` of ``left_hand_omega_x``."""
+    return re.sub("(_omega)?_[^_]+$", "", entry)

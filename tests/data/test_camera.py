@@ -23,9 +23,20 @@ def frames():
 )
 def test_the_unit_is_that_of_the_camera(frames, width, scale, origin):
     tracks, flow = track_objects(frames, 2), FrameSource("flow", "front", 2, width=width)
-    motion = measure(frames, 2.0, flow, fps=20)
+    motion = measure(frames, (2, 2), flow, fps=20)
     np.testing.assert_allclose(motion.position, (tracks.pose * scale + origin).reshape(10, 6))
     np.testing.assert_allclose(
         motion.velocity, (flow_velocity(frames, tracks) * scale * 20).reshape(10, 6), atol=1e-12
     )
     assert motion.angles == [2, 5] and motion.other is None
+
+
+@pytest.mark.parametrize("width", [None, 4.24])
+def test_pixels_need_not_be_reduced_alike_in_both_directions(frames, width):
+    """A picture of 424 x 240 pixels becomes one of 160 x 91."""
+    square, other = (
+        measure(frames, factor, FrameSource("centroid", "front", width=width), 20).position
+        for factor in ((2.65, 2.65), (2.65, 240 / 91))
+    )
+    np.testing.assert_allclose(other[:, 0], square[:, 0])
+    np.testing.assert_allclose(np.ptp(other[:, 1]) / np.ptp(square[:, 1]), 240 / 91 / 2.65)

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from dynmap_rl.data.derive import _derive, align_turns, differentiate
+from dynmap_rl.data.derive import _derive, align_axes, align_turns, differentiate
 from dynmap_rl.data.motion import Motion
+from dynmap_rl.data.tracking import Tracks
 
 EVEN = np.arange(20) / 25
 UNEVEN = np.cumsum(np.random.default_rng(0).uniform(0.02, 0.08, 20))
@@ -44,6 +45,24 @@ def test_a_pose_has_one_angle_in_all_episodes():
     degrees = np.array([-170.0, 170.0])
     align_turns(degrees, [slice(0, 1), slice(1, 2)], 360.0)
     assert np.ptp(degrees) == pytest.approx(20)
+
+
+@pytest.mark.parametrize(
+    "degrees", [(60, 30, 45, 50), (95, 80, 88, 100), (-5, 4, 0, 10), (170, -170, 178, 5)]
+)
+def test_an_axis_has_one_angle_in_all_episodes(degrees):
+    turn = np.radians(np.linspace(0, 30, 20))
+    true = np.concatenate([np.radians(start) + turn for start in degrees])
+    starts, rows = np.radians(degrees), [slice(20 * i, 20 * i + 20) for i in range(4)]
+    measured = np.concatenate([s - np.pi * np.round(s / np.pi) + turn for s in starts])[:, None]
+    tracks = Tracks(None, None, None, None, None, np.array([2.0]), 0.1)
+    motion = Motion(None, [0], found=np.ones((20, 1), bool), tracks=tracks)
+    align_axes(measured, [(own, motion) for own in rows])
+    offset = (measured[:, 0] - true) / np.pi
+    away = np.abs(offset - offset[0])
+    np.testing.assert_allclose(away, np.round(away), atol=1e-9)  # the same axis in all episodes
+    assert np.ptp(measured) < np.radians(65 + 30), "and no half turn between them"
+    assert abs(np.median(measured[::20])) <= np.pi / 4 + 1e-9
 
 
 def test_the_acceleration_of_a_measured_velocity_is_its_derivative():

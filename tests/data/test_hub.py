@@ -16,6 +16,7 @@ from PIL import Image
 
 from dynmap_rl.data.demonstrations import load_dataset, load_meta
 from dynmap_rl.data.format.hub import _describe, draw_episodes
+from dynmap_rl.data.format.reading import read_info
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "collect.py"
 ONLINE = f"""
@@ -175,8 +176,14 @@ def test_without_a_network_there_is_one_clear_error(recording, tmp_path, run):
 
 
 def test_the_card_says_where_the_dynamics_are_from(recording):
-    derived = {"source": "flow", "verdict": "doubtful"}
-    cards = [_describe(load_meta(recording), "Carry the block.", how) for how in (None, derived)]
+    derived, features = {"source": "flow", "verdict": "doubtful"}, read_info(recording)["features"]
+    point = features | {"dynamics.position": {"shape": [2], "names": ["x", "y"]}}
+    cards = [
+        _describe(load_meta(recording), *parts)
+        for parts in ((features, "Carry the block.", None), (point, "Carry the block.", derived))
+    ]
+    assert ["| `dynamics.position` | 2 | x, y (m" in card for card in cards] == [False, True]
+    assert not any("dynamics.found" in card for card in cards)
     assert ["--source flow`" in card for card in cards] == [False, True]
     assert ["simulator's" in card for card in cards] == [True, False]
 

@@ -18,7 +18,7 @@ POSES = make_poses(120)
 
 
 def judge(frames, objects=2):
-    motion = measure(frames, 1.0, FrameSource("tracks", "front", objects), 20)
+    motion = measure(frames, (1, 1), FrameSource("tracks", "front", objects), 20)
     velocity, _ = differentiate(motion.position, np.arange(len(frames)) / 20, "savgol")
     return judge_quality([Derived(7, NAMES[: 3 * objects], motion.position, velocity, motion)])
 
@@ -113,7 +113,7 @@ def test_a_position_that_moves_far_in_every_step_does_not_jump():
 
 def test_the_flow_of_every_object_is_compared_with_its_own_velocity():
     velocity = np.gradient(POSES.reshape(120, 6), axis=0)
-    motion = measure(film(POSES), 1.0, FrameSource("tracks", "front", 2), 20)
+    motion = measure(film(POSES), (1, 1), FrameSource("tracks", "front", 2), 20)
     motion = replace(motion, other=velocity * [1, 1, 1, -1, -1, 1])
     quality = judge_quality([Derived(7, NAMES, motion.position, velocity, motion)])
     check = quality["checks"]["agreement"]

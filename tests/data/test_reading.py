@@ -2,10 +2,14 @@
 
 from pathlib import Path
 
+import lerobot.utils.constants
 import pyarrow as pa
 import pyarrow.parquet as pq
+import pytest
 
-from dynmap_rl.data.format.reading import choose_splits, read_table
+from dynmap_rl.data.format.frames import choose_camera
+from dynmap_rl.data.format.reading import choose_splits, find_dataset, read_table
+from dynmap_rl.utils.files import write_json
 
 
 def test_every_tenth_episode_is_held_out():
@@ -28,3 +32,24 @@ def test_rows_are_in_order_of_time(tmp_path):
     info = {"total_frames": 4, "features": {}}
     assert read_table(tmp_path, info, [])["index"].to_pylist() == [0, 1, 2, 3]
     assert read_table(tmp_path, info, [], by_time=False)["index"].to_pylist() == [2, 3, 0, 1]
+
+
+def test_an_id_is_looked_for_where_lerobot_records(tmp_path, monkeypatch):
+    monkeypatch.setattr(lerobot.utils.constants, "HF_LEROBOT_HOME", tmp_path)
+    with pytest.raises(ValueError, match=str(tmp_path)):
+        find_dataset("me/mine")
+    write_json(tmp_path / "me/mine/meta/info.json", {})
+    assert find_dataset("me/mine") == tmp_path / "me/mine"
+
+
+def test_a_depth_map_is_no_camera():
+    depth, color = (
+        {"dtype": "video", "shape": [64, 64, 3], "info": {"is_depth_map": d}} for d in (True, False)
+    )
+    assert choose_camera(Path(), {"features": {"depth": depth, "color": color}}) == "color"
+    for features in (
+        {"depth": depth},
+        {"depth": {"dtype": "video", "video_info": {"video.is_depth_map": True}}},
+    ):
+        with pytest.raises(ValueError, match="with colours"):
+            choose_camera(Path(), {"features": features}, "depth")

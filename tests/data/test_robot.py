@@ -167,6 +167,11 @@ def test_a_goal_of_chosen_entries(folders):
     assert "dynamics" not in train.keys()
 
 
+def test_a_goal_may_be_the_number_of_the_task(folders):
+    goal = load_robot_dataset(folders / "plain", 20, goal="task_index:0")[0]["train"]["goal"]
+    assert goal.dtype == torch.float32 and goal.shape[-1] == 1 and (goal == 0).all()
+
+
 def test_constants_are_the_ranges_and_a_still_entry_gets_one(folders, splits):
     _, constants = load_robot_dataset(folders / "dynamics", 20)
     assert constants.keys() == {"action", "goal", "position", "velocity", "acceleration"}

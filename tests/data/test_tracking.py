@@ -49,9 +49,12 @@ def test_objects_are_found_with_their_angles_also_where_they_rest(extent, noise)
     poses = make_poses(extent=extent)
     tracks = track_objects(film(poses, SIZE, noise=noise), 2)
     assert tracks.found.all() and not tracks.cut.any()
-    error = np.abs(tracks.pose - truth(poses))
+    error = tracks.pose - truth(poses) - [[0, 0, 0], [0, 0, np.pi / 2]]  # the second object stands
+    error[..., 2] -= np.pi * np.round(error[..., 2] / np.pi)  # axes have no direction
+    error = np.abs(error)
     assert error[..., :2].max() < 1.5 and error[..., :2].mean() < 0.5
     assert error[..., 2].mean() < 0.05
+    assert (tracks.elongation > 1.5).all()
 
 
 def test_velocities_by_flow_are_those_of_the_motion():

@@ -51,6 +51,23 @@ def test_frames_of_cameras_stand_side_by_side(size):
     assert (both[:, size:] == one).all() and (both[:, :size] != one).any()
 
 
+def test_a_renderer_that_goes_while_another_draws_does_not_disturb_it(monkeypatch):
+    check_renderer()
+    model, gone = make_model(), [FrameRenderer(make_model(), CAMERAS, 64)]
+    data, renderer, update = mujoco.MjData(model), FrameRenderer(model, CAMERAS, 64), mujoco.mjv_updateScene
+    mujoco.mj_forward(model, data)
+    expected, renderer.frame[:] = renderer.draw(data), 0
+
+    def update_and_collect(*arguments):
+        gone.clear()  # the last reference
+        return update(*arguments)
+
+    monkeypatch.setattr(mujoco, "mjv_updateScene", update_and_collect)
+    assert (renderer.draw(data) == expected).all() and len(rendering.UNUSED) == 1
+    renderer.draw(data)
+    assert not rendering.UNUSED
+
+
 def test_the_sky_is_above():
     frame = draw(make_model())
     assert frame[0].max() < 60 < frame[-1].min()  # without a skybox, black

@@ -1,5 +1,7 @@
 """Actor on a robot's clock against the delayed actor, whose delays count steps."""
 
+import warnings
+
 import numpy as np
 import pytest
 import torch
@@ -165,6 +167,18 @@ def test_frames_of_the_last_episode_are_not_used():
     np.testing.assert_array_equal(robot.act(2.05), first)
 
 
+def test_frames_of_another_clock_get_a_warning():
+    robot = make_robot()
+    for t in range(6):
+        robot.observe(FRAMES[t], 100 + t * DT)
+        if t < 4:
+            robot.act(1000 + t * DT)
+        else:  # the fourth frame that is too old
+            with pytest.warns(UserWarning, match="one clock") if t == 4 else warnings.catch_warnings():
+                warnings.simplefilter("error" if t > 4 else "default")
+                robot.act(1000 + t * DT)
+
+
 @pytest.mark.parametrize("order", [1, -1])
 def test_the_frame_nearest_to_a_call_is_its_frame(order):
     robot = make_robot()
@@ -196,6 +210,12 @@ def test_wrong_use_gets_one_clear_error():
         robot.observe(FRAMES[0], float("nan"))
     robot.observe(FRAMES[0], 0.0)
     robot.act(5.0)
+    robot.observe(FRAMES[0], 6.0)
+    with pytest.raises(ValueError, match="one clock"):
+        robot.act(5.05)
+    for goal in ([0.5], 0.5, [0.5, float("nan")], np.empty(0)):
+        with pytest.raises(ValueError, match="goal must be 2 finite numbers"):
+            RobotActor(make_actor()).reset(goal)
     for now in (5.0, 0.0, float("nan")):
         with pytest.raises(ValueError, match="after the last call"):
             robot.act(now)

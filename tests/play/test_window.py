@@ -8,7 +8,7 @@ from dynmap_rl.envs.renderer import pygame
 from dynmap_rl.modules.actor import Actor
 from dynmap_rl.modules.checkpoints import make_policy, make_world_model
 from dynmap_rl.play.session import Session
-from dynmap_rl.play.window import PlayWindow
+from dynmap_rl.play.window import PlayWindow, _name_body
 
 
 def press(window, *names):
@@ -45,8 +45,16 @@ def test_keys_and_mouse(window):
     first = played.scene_seed
     press(window, "r", "i", "f5")
     assert played.scene_seed != first and not played.imagining
+    now = played.scene_seed
+    press(window, "page up", "page down")
+    assert played.scene_seed == now and played.delay == 0, "without a policy there are no late frames"
     press(window, "escape")
     assert not window.open
+
+
+def test_bodies_may_have_names_of_several_words():
+    entries = "left_hand_x", "left_hand_omega_x", "left_foot_y", "x", "cart_theta"
+    assert [*map(_name_body, entries)] == ["left_hand", "left_hand", "left_foot", "x", "cart"]
 
 
 def test_the_window_shows_the_scene_and_traces(window):

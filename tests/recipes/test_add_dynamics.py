@@ -10,6 +10,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import robot_dataset
@@ -363,6 +364,50 @@ def test_a_damaged_file_is_named_and_nothing_is_left(images, tmp_path, name):
     with pytest.raises(ValueError, match=name):
         main(Config(dataset=str(tmp_path / "damaged"), output=tmp_path / "new"))
     assert [path.name for path in tmp_path.iterdir()] == ["damaged"]
+
+
+def test_a_copy_holds_what_links_lead_to_and_no_notes_of_file_managers(videos, tmp_path):
+    root = tmp_path / "linked"
+    shutil.copytree(videos[0], root)
+    for name in ("videos", "data"):
+        shutil.move(root / name, tmp_path / name)
+        (root / name).symlink_to(tmp_path / name)
+    (tmp_path / "data/chunk-000/.DS_Store").write_bytes(b"x")
+    (tmp_path / "data/chunk-000/notes.txt").write_text("mine")
+    add_dynamics(root, tmp_path / "output", columns=[0, 1])
+    files = {str(path.relative_to(videos[1])) for path in videos[1].rglob("*") if path.is_file()}
+    copied = {
+        str(path.relative_to(tmp_path / "output"))
+        for path in (tmp_path / "output").rglob("*")
+        if path.is_file()
+    }
+    assert copied == files | {"data/chunk-000/notes.txt"}
+    assert not any(path.is_symlink() for path in (tmp_path / "output").rglob("*"))
+    load_robot_dataset(tmp_path / "output", 20)
+
+
+def spoil(root, column, row, entry):
+    """Write a number that is missing into a dataset of one data file."""
+    [path] = (root / "data").rglob("*.parquet")
+    table = pq.read_table(path)
+    values = np.array(table[column].to_pylist(), np.float32)
+    values[row, entry] = np.nan
+    place = table.column_names.index(column)
+    pq.write_table(
+        table.set_column(place, column, pa.array(values.tolist(), table.schema.field(column).type)), path
+    )
+    return root
+
+
+def test_numbers_that_are_not_used_may_be_missing(images, tmp_path):
+    root = spoil(shutil.copytree(images[0], tmp_path / "state"), "observation.state", 5, 3)
+    add_dynamics(root, tmp_path / "fewer", columns=[0, 1])
+    with pytest.raises(ValueError, match="observation.state .* in row 5, episode 0"):
+        add_dynamics(root, tmp_path / "all")
+    root = spoil(shutil.copytree(images[1], tmp_path / "old"), "dynamics.velocity", 3, 1)
+    found = add_dynamics(root, tmp_path / "new", columns=[0, 1, 2], angles=[2], replace=True)
+    assert found["differences"].keys() == {"position", "acceleration"}
+    assert np.isfinite(read(tmp_path / "new", "dynamics.velocity")).all()
 
 
 def test_a_dataset_is_complete_without_its_page(images, tmp_path, monkeypatch, capsys):

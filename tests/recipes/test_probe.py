@@ -78,12 +78,23 @@ def test_runs_of_one_row_are_named_by_their_folders(trained):
     write_json(trained / "again/eval.json", source)
     shutil.copytree(trained / "none/world_model", trained / "again/world_model")
     none, again, position = (f"{trained / name}" for name in ("none", "again", "position"))
-    models = load_world_models([none, again, f" {position}", f"{none}/"])
+    models, task = load_world_models([none, again, f" {position}", f"{none}/"])
     row = "Only-RGB, decoupled"
+    assert task == "balance_reaching"
     assert list(models) == [f"{row}, none", f"{row}, again", "RGB+[P], decoupled"]
     shutil.copytree(trained / "none", trained / "other" / "none")
     other = f"{trained / 'other' / 'none'}"
-    assert list(load_world_models([none, other])) == [f"{row}, {none}", f"{row}, {other}"]
+    assert list(load_world_models([none, other])[0]) == [f"{row}, {none}", f"{row}, {other}"]
+
+
+def test_world_models_are_probed_on_their_own_task(trained, recordings, tmp_path):
+    shutil.copytree(trained / "none", tmp_path / "bin")
+    write_json(tmp_path / "bin/eval.json", {"world_model": {"task": "bin_dropping", "training": "decoupled"}})
+    result = run(tmp_path, "probe", "--runs", f"bin,{trained / 'none'}")
+    assert result.returncode == 2 and "one task, got bin of bin_dropping" in result.stderr
+    few = "--train_episodes", "2", "--context", "3", "--horizon", "4"
+    result = run(tmp_path, "probe", "--runs", "bin", "--dataset", recordings("bin_dropping"), *few)
+    assert result.returncode == 0, result.stderr
 
 
 def test_a_dataset_of_another_task_is_refused(trained, recordings, tmp_path):

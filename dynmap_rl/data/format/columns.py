@@ -49,15 +49,17 @@ def write_columns(
     stats = read_json(path) if (path := root / "meta" / "stats.json").exists() else {}
     try:
         shutil.rmtree(temporary, ignore_errors=True)
-        for file in sorted(path for path in root.rglob("*") if path.is_file()):
+        for file in sorted(
+            folder / name for folder, _, files in root.walk(follow_symlinks=True) for name in files
+        ):
             relative = file.relative_to(root)
-            if relative.parts[0].startswith(".") or str(relative) in replaced:
-                continue  # names with a dot are the hub's notes on a download
+            if any(part.startswith(".") for part in relative.parts) or str(relative) in replaced:
+                continue  # names with a dot are notes of the hub and of file managers
             target = temporary / relative
             target.parent.mkdir(parents=True, exist_ok=True)
-            if relative.parts[0] == "data":
+            if relative.parts[0] == "data" and file.suffix == ".parquet":
                 _write_rows(file, target, table["index"].to_numpy(), values)
-            elif relative.parts[:2] == ("meta", "episodes"):
+            elif relative.parts[:2] == ("meta", "episodes") and file.suffix == ".parquet":
                 _write_episodes(file, target, dict(spans(table["episode_index"].to_numpy())), values)
             elif relative.parts[0] == "videos":
                 _link(file, target)
@@ -86,7 +88,7 @@ def _write_rows(file: Path, target: Path, index: np.ndarray, values: dict[str, n
     with quiet():
         from lerobot.datasets.io_utils import write_table_one_row_group_per_episode
 
-    rows = pq.ParquetFile(file).read()
+    rows = _read(file)
     place = np.searchsorted(index, rows["index"].to_numpy())
     rows = rows.drop_columns([name for name in values if name in rows.column_names])
     for name, numbers in values.items():
@@ -94,6 +96,13 @@ def _write_rows(file: Path, target: Path, index: np.ndarray, values: dict[str, n
         flat = pa.array(numbers[place].ravel())
         rows = rows.append_column(name, pa.FixedSizeListArray.from_arrays(flat, size) if size > 1 else flat)
     write_table_one_row_group_per_episode(_name_columns(rows), target)
+
+
+def _read(file: Path) -> pa.Table:
+    try:
+        return pq.ParquetFile(file).read()
+    except (OSError, pa.ArrowException) as error:
+        raise ValueError(f"{file} is damaged ({error}); restore it or download the dataset again") from error
 
 
 def _name_columns(rows: pa.Table) -> pa.Table:
@@ -109,10 +118,7 @@ def _write_episodes(
     file: Path, target: Path, rows_of: dict[int, slice], values: dict[str, np.ndarray]
 ) -> None:
     """Write the episodes' metadata with statistics of the new columns."""
-    try:
-        rows = pq.ParquetFile(file).read()
-    except (OSError, pa.ArrowException) as error:
-        raise ValueError(f"{file} is damaged ({error}); restore it or download the dataset again") from error
+    rows = _read(file)
     old = tuple(f"stats/{name}/" for name in values)
     rows = rows.drop_columns([name for name in rows.column_names if name.startswith(old)])
     for name, numbers in values.items():

@@ -21,7 +21,7 @@ BLOCK = 100  # frames decoded at a time, as a whole episode in full size may not
 
 
 def choose_camera(root: Path, info: dict, camera: str | None = None) -> str:
-    """Return the camera's column, by default the first camera of the dataset.
+    """Return the camera's column, by default the first camera of the dataset; depth maps are no cameras.
 
     Args:
         root: folder of the dataset, for messages.
@@ -31,17 +31,27 @@ def choose_camera(root: Path, info: dict, camera: str | None = None) -> str:
     Raises:
         ValueError: the dataset has no camera, or no camera of that name.
     """
-    cameras = [name for name, f in info["features"].items() if f["dtype"] in ("image", "video")]
+    cameras = [
+        n for n, f in info["features"].items() if f["dtype"] in ("image", "video") and not _is_depth(f)
+    ]
     if not cameras:
-        raise ValueError(f"{root} must have an image or video column, got none; choose another dataset")
+        raise ValueError(
+            f"{root} must have an image or video column with colours, got none; choose another dataset"
+        )
     if camera not in (None, *cameras):
         raise ValueError(f"--camera must be one of {', '.join(cameras)}, got {camera!r}")
     return camera or cameras[0]
 
 
+def _is_depth(feature: dict) -> bool:
+    """Return whether a feature is marked as a depth map, in the places where LeRobot writes it."""
+    notes = (feature.get("info") or {}) | (feature.get("video_info") or {})
+    return bool(notes.get("is_depth_map") or notes.get("video.is_depth_map"))
+
+
 def iterate_frames(
     root: Path, info: dict, camera: str, size: tuple[int, int] | None = None, widest: int | None = None
-) -> Iterator[tuple[int, np.ndarray, float]]:
+) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
     """Iterate over the episodes' frames.
 
     Frames are reduced with ``cv2.INTER_AREA``, which averages, and enlarged with ``cv2.INTER_LINEAR``.
@@ -54,7 +64,8 @@ def iterate_frames(
         widest: width that wider frames are reduced to, in place of ``size``.
 
     Yields:
-        The episode's index, its frames uint8 ``[T, height, width, 3]`` (RGB), and the ratio of stored to returned width.
+        The episode's index, its frames uint8 ``[T, height, width, 3]`` (RGB), and the ratios of stored to returned width and
+        height, ``[2]``.
 
     Raises:
         ValueError: a file is damaged; the message names the file.
@@ -74,9 +85,9 @@ def iterate_frames(
             )
             frames = []
             for block in blocks:
-                width = block[0].shape[1]
+                height, width = block[0].shape[:2]
                 frames += [_resize(frame, size or _reduced(frame, widest)) for frame in block]
-            yield episode, np.stack(frames), width / frames[0].shape[1]
+            yield episode, np.stack(frames), np.divide([width, height], frames[0].shape[1::-1])
 
 
 def _read_episodes(root: Path, camera: str) -> dict[int, dict]:

@@ -43,9 +43,7 @@ How it was made: PyMunk simulates, pygame draws, {maker}. The command was
 | `next.reward`, `next.done`, `next.success` | 1 | after the action |
 | `expert_action` | 3 | what the expert would have done, without noise and pushes: to be imitated |
 | `disturbed` | 1 | a push acted in this step in the place of the expert |
-| `dynamics.position` | 6 | cart x, y, theta, block x, y, theta (m, m, rad) |
-| `dynamics.velocity` | 6 | its rate (m/s, rad/s) |
-| `dynamics.acceleration` | 6 | change of the velocity (m/s^2, rad/s^2) |
+{dynamics}
 
 {origin}
 
@@ -54,6 +52,12 @@ How it was made: PyMunk simulates, pygame draws, {maker}. The command was
 SIMULATED = f"""\
 The dynamics are the simulator's. The acceleration is the change of the velocity since the last step over {CONTROL_DT} s, and
 0 at the start."""
+CONTENTS = {
+    "position": "{names} (m, angles in rad)",
+    "velocity": "its rate (m/s, rad/s)",
+    "acceleration": "change of the velocity (m/s^2, rad/s^2)",
+    "found": "whether what an entry belongs to was found in the frame",
+}
 DERIVATION = """\
 The dynamics were derived with `python recipes/add_dynamics.py --source {source}`, and are judged {verdict}. All options and
 checks are in `meta/dynamics.json`."""
@@ -96,7 +100,9 @@ def push_dataset(root: str | Path, repo_id: str) -> None:
             dataset.push_to_hub(
                 tags=["dynamics", "world-model", "imitation-learning"],
                 license="mit",
-                dataset_description=_describe(meta, dataset.meta.tasks.index[0], derived),
+                dataset_description=_describe(
+                    meta, dataset.meta.features, dataset.meta.tasks.index[0], derived
+                ),
                 paper=PAPER,
                 url="https://github.com/Automation-Research-Team/DynamicsMapping-2D (the paper's)",
                 citation_bibtex=CITATION,
@@ -131,7 +137,7 @@ def draw_episodes(episodes: TensorDict, path: Path, rows: int = 3, columns: int 
 KINDS = {"human": "Demonstrations of a person", "undisturbed": "Undisturbed demonstrations"}
 
 
-def _describe(meta: dict, instruction: str, derived: dict | None) -> str:
+def _describe(meta: dict, features: dict, instruction: str, derived: dict | None) -> str:
     splits, task, kind = meta["splits"], meta["task"], meta["kind"]
     train, test = (end - first for first, end in (splits["train"], splits["eval"]))
     collect = f"collect.py --task {task} --kind {kind} --episodes {train} --eval_episodes {test}"
@@ -158,6 +164,11 @@ def _describe(meta: dict, instruction: str, derived: dict | None) -> str:
         picture=PICTURE,
         maker=maker,
         command=command,
+        dynamics="\n".join(
+            f"| `{column}` | {feature['shape'][0]} | {content.format(names=', '.join(feature['names']))} |"
+            for name, content in CONTENTS.items()
+            if (feature := features.get(column := f"dynamics.{name}"))
+        ),
         origin=DERIVATION.format(**derived) if derived else SIMULATED,
         meta=META,
         splits=", ".join(f"{name} {first} to {end - 1}" for name, (first, end) in splits.items()),

@@ -23,7 +23,8 @@ INFO = {"total_frames": int, "features": {str: {"dtype": str, "shape": [int]}}}
 def find_dataset(dataset: str | Path) -> Path:
     """Return the local folder of a dataset.
 
-    A dataset named by a hub id is downloaded. Without a network it is found in LeRobot's cache.
+    A dataset named by a hub id is first looked for in the folder that LeRobot records to (``HF_LEROBOT_HOME``), and then
+    downloaded. Without a network it is found in LeRobot's cache.
 
     Args:
         dataset: local folder or hub id.
@@ -38,8 +39,10 @@ def find_dataset(dataset: str | Path) -> Path:
         raise ValueError(f"no dataset at {dataset}; record one with recipes/collect.py --output {dataset}")
     from httpx import HTTPError
     from huggingface_hub import snapshot_download
-    from lerobot.utils.constants import HF_LEROBOT_HUB_CACHE
+    from lerobot.utils.constants import HF_LEROBOT_HOME, HF_LEROBOT_HUB_CACHE
 
+    if ((folder := HF_LEROBOT_HOME / dataset) / "meta" / "info.json").exists():
+        return folder
     place = {"repo_type": "dataset", "revision": LEROBOT_VERSION, "cache_dir": HF_LEROBOT_HUB_CACHE}
     try:
         return Path(snapshot_download(dataset, **place))
@@ -50,7 +53,8 @@ def find_dataset(dataset: str | Path) -> Path:
     ) as error:  # all errors of the hub's client and of the network below it
         reason = first_line(error)
         raise ValueError(
-            f"no dataset at {dataset}, neither as a folder nor with the tag {LEROBOT_VERSION} on the hub ({reason}); "
+            f"no dataset at {dataset}, neither as a folder, nor in {HF_LEROBOT_HOME}, nor with the tag {LEROBOT_VERSION} on "
+            f"the hub ({reason}); "
             "check the name and the network, or record one with recipes/collect.py"
         ) from error
 
@@ -214,7 +218,9 @@ def read_table(root: Path, info: dict, columns: list[str], by_time: bool = True)
     return table.sort_by("index") if by_time else table
 
 
-def read_column(root: Path, info: dict, table: pa.Table, name: str, dtype=np.float32) -> torch.Tensor:
+def read_column(
+    root: Path, info: dict, table: pa.Table, name: str, dtype=np.float32, entries: list[int] | None = None
+) -> torch.Tensor:
     """Copy the numbers of a column.
 
     Args:
@@ -223,6 +229,7 @@ def read_column(root: Path, info: dict, table: pa.Table, name: str, dtype=np.flo
         table: rows of the dataset (see :func:`read_table`).
         name: the column.
         dtype: type of the result, except for columns of flags.
+        entries: those that are read; by default all.
 
     Returns:
         ``[N, D]``, bool for a column of flags.
@@ -235,20 +242,24 @@ def read_column(root: Path, info: dict, table: pa.Table, name: str, dtype=np.flo
         flat = flat.flatten()
     values = flat.to_numpy(zero_copy_only=False)
     size = math.prod(info["features"][name]["shape"]) if name in info["features"] else 1
-    numbers = values.dtype.kind in "biuf" and not table[name].null_count
-    if not numbers or not np.isfinite(values).all():
-        row = int(np.flatnonzero(~np.isfinite(values))[0]) // size if numbers else None
-        where = (
-            f"got {values[row * size : (row + 1) * size].tolist()} in row {row}" if numbers else "got others"
-        )
-        if numbers and "episode_index" in table.column_names:
-            where += f", episode {table['episode_index'][row]}"
-        raise ValueError(
-            f"{name} of {root} must be finite numbers, {where}; correct them, or delete the episode (lerobot-edit-dataset)"
-        )
+    advice = "correct them, or delete the episode (lerobot-edit-dataset)"
+    if values.dtype.kind not in "biuf" or table[name].null_count:
+        raise ValueError(f"{name} of {root} must be finite numbers, got others; {advice}")
     if len(values) != size * len(table):
         raise ValueError(f"{name} of {root} must have {size} numbers in every row; record it again")
-    return torch.from_numpy(values.astype(bool if values.dtype == bool else dtype)).reshape(-1, size)
+    values = values.reshape(-1, size)[:, slice(None) if entries is None else entries]
+    if not (finite := np.isfinite(values).all(1)).all():
+        row = int(finite.argmin())
+        where = f"got {values[row].tolist()} in row {row}"
+        if "episode_index" in table.column_names:
+            where += f", episode {table['episode_index'][row]}"
+        raise ValueError(f"{name} of {root} must be finite numbers, {where}; {advice}")
+    return torch.from_numpy(values.astype(bool if values.dtype == bool else dtype))
+
+
+def is_vector(feature: dict) -> bool:
+    """Return whether a feature of ``meta/info.json`` is a column of numbers or flags."""
+    return len(feature["shape"]) == 1 and feature["dtype"].startswith(("float", "int", "uint", "bool"))
 
 
 def spans(episode: np.ndarray) -> list[tuple[int, slice]]:

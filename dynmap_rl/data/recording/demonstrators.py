@@ -9,8 +9,10 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from dynmap_rl.envs.protocol import BaseTask, SimulatedWorld
+from dynmap_rl.envs.protocol import BaseTask, SimulatedWorld, check_world
+from dynmap_rl.envs.task import Task
 from dynmap_rl.envs.tasks import get_task
+from dynmap_rl.envs.world import limit_actions
 from dynmap_rl.keys import DYNAMICS
 
 
@@ -48,7 +50,8 @@ def _open_simulator(task: str, kind: type) -> tuple[Callable, SimulatedWorld]:
         ValueError: the scene's seed does not determine the start, or start and actions do not determine the episode.
     """
     rules = get_task(task)
-    world = rules.begin(0)
+    world, draw = rules.begin(0), rules.make_renderer()
+    check_world(rules, world, np.array(draw(world)), state=False)
     rows = list(_demonstrate(rules, lambda world: None, world, 0))
     world = rules.begin(0, None, world)
     for t, row in enumerate(rows):
@@ -65,7 +68,7 @@ def _open_simulator(task: str, kind: type) -> tuple[Callable, SimulatedWorld]:
                 f"the same seed and actions must lead to the same episode of {task}, but after a reset they differ from "
                 f"step {t} on; its reset must set all that the physics depend on, such as masses"
             )
-    return rules.make_renderer(), world
+    return draw, world
 
 
 def _demonstrate(
@@ -98,7 +101,11 @@ def _demonstrate(
         change = noise * rng.standard_normal(len(limit)).astype(np.float32) * limit
         change = change * (not getattr(expert, "exact", False))
         row |= {"action": (action + change).clip(-limit, limit), "expert_action": action.clip(-limit, limit)}
+        if isinstance(rules, Task):  # a cart has more limits
+            row["expert_action"] = limit_actions([world], [action])[0].astype(np.float32)
         rules.step([world], [row["action"]])
+        if isinstance(rules, Task):
+            row["action"] = np.array(world.action, np.float32)
         end = {"done": t + 1 == layout.steps or rules.is_over(world), "dropped": world.dropped}
         end |= {"is_success": rules.is_success(world)}
         row |= {f"next.{name}": np.array([value], bool) for name, value in end.items()}

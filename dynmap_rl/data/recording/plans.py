@@ -62,7 +62,8 @@ def plan_demonstrations(
 ) -> list[Plan]:
     """Plan demonstrations with the checkpoints in turn; two of three episodes have noise, one of three pushes too.
 
-    Noise and pushes lead to states from which the expert must recover, as a policy will have to.
+    Noise and pushes lead to states from which the expert must recover, as a policy will have to. A task with a
+    demonstrator has no pushes.
 
     Args:
         task: name of the task.
@@ -72,7 +73,8 @@ def plan_demonstrations(
         expert: folder or task of the expert's checkpoints; by default the expert that ships for the task.
         disturbed: whether there are noise and pushes.
     """
-    checkpoints, pushed = find_checkpoints(task, expert), get_task(task).pushes
+    checkpoints, rules = find_checkpoints(task, expert), get_task(task)
+    pushed = 0 if rules.has_demonstrator else rules.pushes
     plans = []
     for i in range(start, start + count):
         seed = scene_seed(split, i)

@@ -21,6 +21,7 @@ os.environ.setdefault("LP_NUM_THREADS", "0")  # Mesa's threads cost more than th
 
 FLAGS = "SHADOW", "REFLECTION", "SKYBOX", "HAZE", "FOG"  # drawn in passes of their own
 BACKENDS = "egl", "osmesa"
+UNUSED: list[tuple] = []  # canvases and contexts of renderers that are gone
 FACES = 2000  # of a mesh, from which on it is heavy
 
 
@@ -70,12 +71,15 @@ class FrameRenderer:
         model.vis.quality.shadowsize = model.vis.quality.offsamples = 0
         model.geom_rgba[list(hide), 3] = 0
         self.model, self.cameras = model, [camera.make() for camera in cameras]
+        _free_unused()
         self.canvas = make_canvas(size)
         self.canvas.make_current()
         self.context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self.context)
-        finalizer = weakref.finalize(self, _free, self.canvas, self.context)
+        # The garbage collector may come while another renderer draws, whose context must stay the current one.
+        finalizer = weakref.finalize(self, UNUSED.append, (self.canvas, self.context))
         finalizer.atexit = False
+        atexit.register(_free_unused)
         atexit.register(finalizer)  # later than MuJoCo's own, and therefore called before
         drawn = 2 * (model.ngeom + model.nsite + model.ntendon)  # beyond maxgeom, MuJoCo leaves geoms out
         self.scene = mujoco.MjvScene(model, maxgeom=max(1000, drawn))
@@ -89,6 +93,7 @@ class FrameRenderer:
 
     def draw(self, data: mujoco.MjData) -> np.ndarray:
         """Draw the state of the model, uint8 ``[size, cameras * size, 3]``."""
+        _free_unused()
         self.canvas.make_current()
         frames = []
         for camera in self.cameras:
@@ -100,11 +105,13 @@ class FrameRenderer:
         return np.concatenate(frames, 1)
 
 
-def _free(canvas, context: mujoco.MjrContext) -> None:
-    """Free the memory of a renderer while the libraries are still there."""
-    canvas.make_current()
-    context.free()
-    canvas.free()
+def _free_unused() -> None:
+    """Free the memory of renderers that are no longer used."""
+    while UNUSED:
+        canvas, context = UNUSED.pop()
+        canvas.make_current()
+        context.free()
+        canvas.free()
 
 
 def make_canvas(size: int):
