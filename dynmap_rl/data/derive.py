@@ -261,9 +261,10 @@ def _check_lengths(root: Path, rows: dict[int, slice], methods: list[str], windo
     needed = window if "savgol" in methods else 3
     lengths = {episode: own.stop - own.start for episode, own in rows.items()}
     if short := [f"{episode} ({length} steps)" for episode, length in lengths.items() if length < needed]:
+        shorter = "use --method central or a shorter --window, or " if needed > 3 else ""
         raise ValueError(
-            f"{root} must have at least {needed} steps in every episode, got fewer in {', '.join(short)}; use --method "
-            "central or a shorter --window, or delete these episodes (lerobot-edit-dataset)"
+            f"{root} must have at least {needed} steps in every episode, got fewer in {', '.join(short)}; {shorter}delete "
+            "these episodes (lerobot-edit-dataset)"
         )
 
 

@@ -58,7 +58,7 @@ class DelayTransform(Transform):
         if self.seed is None or isinstance(self.seed, Integral):
             self._generators = [make_generator(self.seed, world) for world in range(count)]
         else:
-            self._generators = [make_generator(seed) for seed in self.seed]
+            self._generators = [make_generator(int(seed)) for seed in self.seed]
         if len(self._generators) != count:
             raise ValueError(
                 f"seed must have one seed for each of {count} worlds, got {len(self._generators)}"

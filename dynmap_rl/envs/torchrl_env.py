@@ -146,6 +146,8 @@ class DynmapBatchedEnv(EnvBase):
         if seeds is not None and torch.as_tensor(seeds).is_floating_point():
             raise ValueError("scene_seed must be integers")
         rows = mask.nonzero().flatten().tolist()
+        if len(rows) < n and None in self.worlds:
+            raise RuntimeError("the environment has not begun; reset all worlds first")
         for i in rows:
             seed = int(seeds[i]) if seeds is not None else int(self.rng.integers(2**63))
             self.worlds[i] = self.task.begin(seed, self.ranges, self.worlds[i])

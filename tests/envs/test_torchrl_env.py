@@ -284,6 +284,12 @@ def test_invalid_action_raises():
         env.step(env.reset().set("action", torch.full((2, 3), torch.nan)))
 
 
+def test_a_part_of_the_worlds_cannot_begin_alone():
+    env = DynmapBatchedEnv(num_envs=2)
+    with pytest.raises(RuntimeError, match="reset all worlds first"):
+        env.reset(TensorDict({"_reset": torch.tensor([[True], [False]])}, [2]))
+
+
 def test_what_a_reset_does_not_know_is_refused():
     env = DynmapBatchedEnv(num_envs=2)
     with pytest.raises(RuntimeError, match="call reset first"):

@@ -26,14 +26,21 @@ from dynmap_rl.utils.files import read_json, write_json
 from dynmap_rl.utils.weights import fingerprint
 
 
-def make_run(folder, kind, architecture="glimpse", goal=2, position=6):
+def make_run(folder, kind, architecture="glimpse", goal=2, position=6, **frames):
     sizes = {"action": 3, "goal": goal, "position": position}
     meta = {name: {"low": [-1.0] * n, "high": [2.0] * n} for name, n in sizes.items()}
-    world_model = make_world_model(meta, ("position",), 16, 24, architecture)
+    world_model = make_world_model(meta, ("position",), 16, 24, architecture, **frames)
     policy = make_own_policy(meta, kind, world_model, width=20)
     save_world_model(folder / "world_model", world_model)
     save_policy(folder / "seed_1" / "policy", policy, world_model)
     return world_model, policy
+
+
+@pytest.mark.parametrize("sizes", [{"goal": 3}, {"image_size": 32}, {"cameras": 2}])
+def test_runs_of_other_sizes_are_refused(tmp_path, sizes):
+    make_run(tmp_path / "run", "feedforward", **sizes)
+    with pytest.raises(ValueError, match=f"got other sizes: {sizes}"):
+        export_to_lerobot(tmp_path / "run", tmp_path / "exported", seed=1)
 
 
 @pytest.mark.parametrize(

@@ -36,7 +36,9 @@ def export_to_lerobot(run: str | Path, folder: str | Path, seed: int = 0) -> Pat
     actor = load_actor(run, seed)
     world_model, policy = actor.world_model, actor.policy
     sizes = {"action": policy.action.size, "goal": policy.goal.size}
-    if other := {name: size for name, size in sizes.items() if size != DynmapConfig().sizes[name]}:
+    sizes |= {"image_size": world_model.image_size, "cameras": world_model.cameras}
+    expected = DynmapConfig().sizes | {"image_size": FRAME_SHAPE[0], "cameras": 1}
+    if other := {name: size for name, size in sizes.items() if size != expected[name]}:
         raise ValueError(f"{run} must be a run of a task of cart and block, got other sizes: {other}")
     files = run / "config.json", run / "eval.json"
     settings, results = (read_json(file) if file.exists() else {} for file in files)
