@@ -52,7 +52,7 @@ class Config:
     eval: Evaluation = Evaluation(paper_episodes=0)
     # Film failed episodes alone, where there are any.
     failures: bool = False
-    # Device, with --policy of a run, and cores.
+    # Device, with --policy, and cores.
     compute: Compute = Compute()
     # JSON file of the result; by default eval.json beside the page.
     output: Path | None = None
@@ -154,7 +154,8 @@ def load_policy(config: Config, folder: Path, instruction: str):
         ) from error
     refuse(config, Config(), ["seed"], "a LeRobot policy")
     torch.set_num_threads(config.compute.threads)
-    return LeRobotActor(config.policy, instruction=instruction)
+    device = choose_device(config.compute.device)
+    return LeRobotActor(config.policy, device, instruction=instruction)
 
 
 def judge_expert(config: Config) -> tuple[Path, str, dict]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -51,7 +52,9 @@ def export_to_onnx(run: str | Path, folder: str | Path, seed: int = 0) -> Path:
     from dynmap_rl.runs.lookup import load_actor
 
     actor, folder, batch = load_actor(run, seed).eval(), Path(folder), torch.export.Dim("batch")
-    folder.mkdir(parents=True, exist_ok=True)
+    temporary = folder.with_name(f"{folder.name}.tmp")  # parts of two exports would fit together
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir(parents=True)
     for part, (function, sizes, outputs) in _list_parts(actor).items():
         size, cameras = actor.world_model.image_size, actor.world_model.cameras
         pixels = torch.zeros(2, 3, size, cameras * size, dtype=torch.uint8)
@@ -67,7 +70,11 @@ def export_to_onnx(run: str | Path, folder: str | Path, seed: int = 0) -> Path:
                 output_names=outputs,
                 dynamic_shapes=(tuple({0: batch} for _ in inputs),),
             )
-        program.save(folder / f"{part}.onnx")
+        program.save(temporary / f"{part}.onnx")
+    folder.mkdir(exist_ok=True)
+    for path in temporary.iterdir():
+        path.replace(folder / path.name)
+    temporary.rmdir()
     return folder
 
 
@@ -141,6 +148,7 @@ class OnnxActor:
         import onnxruntime
 
         options = onnxruntime.SessionOptions()
+        options.log_severity_level = 3  # without warnings about shapes that are merged
         options.intra_op_num_threads = options.inter_op_num_threads = threads
         files = {part: Path(folder) / f"{part}.onnx" for part in PARTS}
         if missing := [file.name for file in files.values() if not file.exists()]:

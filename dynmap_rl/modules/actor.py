@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable
 
 import torch
@@ -106,11 +107,13 @@ class LatentActor(TensorDictModuleBase):
         super().__init__()
         self.policy, self.states, self.goal, self.action, self.is_init = policy, states, goal, action, is_init
         self.policy_memory = tuple(policy_memory) if isinstance(policy, RecurrentPolicy) else ()
+        self.blind = False
         self.in_keys = [unravel_key(k) for k in (*states, goal, is_init, *self.policy_memory)]
         self.out_keys = [unravel_key(action), *(unravel_key(("next", k)) for k in self.policy_memory)]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action and the next memory."""
+        warn_without_memory(self, tensordict, self.policy_memory)
         return self.act(tensordict, *(tensordict[key] for key in self.states))
 
     def act(self, tensordict: TensorDictBase, latent, hidden1, hidden2) -> TensorDictBase:
@@ -173,7 +176,7 @@ class Actor(TensorDictModuleBase):
         policy_memory: tuple[NestedKey, ...] = POLICY_MEMORY,
     ):
         super().__init__()
-        states = (latent, memory[0], memory[2])
+        states, self.blind = (latent, memory[0], memory[2]), False
         self.world_model, self.mixed = world_model, mixed
         self.latent_actor = LatentActor(policy, states, goal, action, is_init, policy_memory)
         self.pixels, self.action, self.is_init = pixels, action, is_init
@@ -190,6 +193,7 @@ class Actor(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Observe, act and predict."""
+        warn_without_memory(self, tensordict, self.memory)
         return self.predict(self.act(self.observe(tensordict)))
 
     def observe(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -251,6 +255,22 @@ def check_memory(tensordict: TensorDictBase, keys: Iterable[NestedKey], begins: 
         raise KeyError(
             f"{missing[0]} is missing after the first step; append actor.make_tensordict_primer() to the environment"
         )
+
+
+def warn_without_memory(
+    actor: LatentActor | Actor, tensordict: TensorDictBase, keys: Iterable[NestedKey]
+) -> None:
+    """Warn if neither memory nor the start of episodes is there in two calls in a row, as in an environment without both."""
+    blind = (
+        any(tensordict.get(key, None) is None for key in keys) and tensordict.get(actor.is_init, None) is None
+    )
+    if blind and actor.blind:
+        warnings.warn(
+            "the actor had no memory in two calls in a row; append InitTracker() and actor.make_tensordict_primer() to the "
+            "environment, or pass on what is written under next",
+            stacklevel=3,
+        )
+    actor.blind = blind
 
 
 def remember(tensordict: TensorDictBase, keys, values) -> None:

@@ -33,6 +33,17 @@ class BackboneEncoder(Encoder):
         return ((x - self.mean) / self.std).contiguous(memory_format=torch.channels_last)
 
 
+def load_imagenet(encoder: nn.Module) -> None:
+    """Load the weights of torchvision into the ResNets of an encoder.
+
+    Raises:
+        ValueError: torchvision is missing, or its weights cannot be loaded.
+    """
+    for part in encoder.modules():
+        if isinstance(part, ResNetEncoder):
+            part.load_imagenet()
+
+
 class ResNetEncoder(BackboneEncoder):
     """ResNet-18 (He et al. 2016) without its last pooling, which would lose the places of things.
 

@@ -53,8 +53,8 @@ class ChunkActor:
             self.reset()
         # Where a robot has waited for a chunk, its step may lie beyond the last chunk.
         before = min(step - 1, max(self.steps, default=-1))
-        chunk = {before: self.steps[before]} if before in self.steps else {}
-        td = self._after(chunk.get(before), goal).set(self.actor.pixels, pixels)
+        chunk = {step - 1: self.steps[before]} if before in self.steps else {}
+        td = self._after(chunk.get(step - 1), goal).set(self.actor.pixels, pixels)
         for t in range(step, step + self.size):
             td = self.actor.observe(td)
             if t < step + self.delay and t in self.steps:

@@ -29,6 +29,9 @@ class Encoder(nn.Module):
         side = self.image_size
         if pixels.shape[-3:] != (3, side, side):
             raise ValueError(f"pixels must be [..., 3, {side}, {side}], got {list(pixels.shape)}")
+        if not pixels.numel():
+            size = self.encode(pixels.new_zeros(1, 3, side, side)).shape[-1]
+            return torch.zeros(*pixels.shape[:-3], size, device=pixels.device)
         # A frame in 0..1 would be read as a black one.
         if pixels.is_floating_point() and not torch.compiler.is_compiling() and 0 < pixels.amax() <= 1:
             raise ValueError(

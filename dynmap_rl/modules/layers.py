@@ -39,11 +39,12 @@ def hat_kernels(centers: torch.Tensor, count: int, spacing: float = 1.0, size: i
     Args:
         centers: middles of the samples, ``[...]``, in -1..1 from edge to edge.
         count: number of samples.
-        spacing: distance of the samples in pixels, 1 or more.
+        spacing: distance of the samples in pixels.
         size: pixels of the axis.
 
     Returns:
-        ``[..., count, size]``; the sum over the pixels is 1 inside the frame.
+        ``[..., count, size]``; the sum over the pixels is 1 inside the frame for whole spacings, and varies about 1 with
+        the place of the sample for others.
     """
     steps = (torch.arange(count, device=centers.device) - (count - 1) / 2) * spacing
     pixels = torch.arange(size, device=centers.device) + 0.5

@@ -31,8 +31,8 @@ class Normalizer(nn.Module):
         return self.center.numel()
 
     def normalize(self, x: torch.Tensor) -> torch.Tensor:
-        """Map ``[..., D]`` from SI units to [-1, 1]."""
-        return (x - self.center) / self.scale
+        """Map ``[..., D]`` from SI units to [-1, 1], in the type of the weights."""
+        return (x.to(self.center.dtype) - self.center) / self.scale
 
     def denormalize(self, x: torch.Tensor) -> torch.Tensor:
         """Map ``[..., D]`` from [-1, 1] to SI units."""

@@ -78,11 +78,13 @@ class RobotActor:
         """Take a frame, uint8 ``[S, cameras * S, 3]``, and the time at which it was taken.
 
         Raises:
-            ValueError: the frame is not uint8 ``[H, W, 3]``, the time is not finite, or :meth:`reset` was not called.
+            ValueError: the frame has another form or size, the time is not finite, or :meth:`reset` was not called.
         """
         frame = np.array(frame)  # a camera may use its buffer again
-        if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[-1] != 3:
-            raise ValueError(f"frame must be uint8 [H, W, 3], got {frame.dtype} {list(frame.shape)}")
+        model = self.actor.world_model
+        shape = model.image_size, model.cameras * model.image_size, 3
+        if frame.dtype != np.uint8 or frame.shape != shape:
+            raise ValueError(f"frame must be uint8 {list(shape)}, got {frame.dtype} {list(frame.shape)}")
         if not math.isfinite(timestamp):
             raise ValueError(f"timestamp must be finite, got {timestamp}")
         self._check_reset()

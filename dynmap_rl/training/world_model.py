@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDictBase
 
 from dynmap_rl.evaluation.errors import prediction_errors
-from dynmap_rl.modules.backbones import ResNetEncoder
+from dynmap_rl.modules.backbones import load_imagenet
 from dynmap_rl.modules.checkpoints import make_world_model
 from dynmap_rl.modules.supervision import parse_supervision
 from dynmap_rl.modules.world_model import WorldModel
@@ -38,9 +38,7 @@ def build_world_model(
     frames = {"image_size": height, "cameras": width // height}
     model = make_world_model(constants, supervision, architecture=settings.architecture, **frames)
     if settings.architecture == "resnet18_imagenet":
-        for part in model.encoder.modules():
-            if isinstance(part, ResNetEncoder):
-                part.load_imagenet()
+        load_imagenet(model.encoder)
     return model
 
 

@@ -21,7 +21,7 @@ from dynmap_rl.modules.checkpoints import (
     save_world_model,
 )
 from dynmap_rl.modules.checkpoints import make_policy as make_own_policy
-from dynmap_rl.runs.lookup import load_world_model_of, task_of_run
+from dynmap_rl.runs.lookup import load_actor, load_world_model_of, task_of_run
 from dynmap_rl.utils.files import read_json, write_json
 from dynmap_rl.utils.weights import fingerprint
 
@@ -118,6 +118,41 @@ def config_of(folder):
     config = DynmapConfig.from_pretrained(folder)
     config.pretrained_path = folder
     return config
+
+
+def test_policies_keep_the_world_models_that_they_were_trained_with(tmp_path):
+    models = {}
+    for seed in (0, 1):
+        models[seed], _ = make_run(tmp_path / f"run_{seed}", "recurrent")
+        exported = export_to_lerobot(tmp_path / f"run_{seed}", tmp_path / f"exported_{seed}", seed=1)
+        import_from_lerobot(exported, tmp_path / "both", seed=seed)
+    for seed, model in models.items():
+        assert fingerprint(load_actor(tmp_path / "both", seed).world_model) == fingerprint(model)
+
+
+@pytest.mark.parametrize("changes", [{"kind": "feedforward"}, {"supervision": "position,velocity"}])
+def test_weights_of_another_architecture_are_refused(tmp_path, changes):
+    make_run(tmp_path / "run", "recurrent")
+    exported = export_to_lerobot(tmp_path / "run", tmp_path / "exported", seed=1)
+    config = config_of(exported)
+    for name, value in changes.items():
+        setattr(config, name, value)
+    with pytest.raises(ValueError, match="weights of another architecture"):
+        DynmapPolicy.from_pretrained(exported, config=config)
+
+
+def test_damaged_checkpoints_are_named(tmp_path):
+    make_run(tmp_path / "run", "recurrent")
+    exported = export_to_lerobot(tmp_path / "run", tmp_path / "exported", seed=1)
+    (exported / "model.safetensors").write_bytes(b"nothing")
+    with pytest.raises(ValueError, match="no weights that can be read"):
+        import_from_lerobot(exported, tmp_path / "back")
+    settings = read_json(exported / "config.json")
+    write_json(exported / "config.json", settings | {"of_a_newer_version": 1})
+    for load in (LeRobotActor, lambda folder: import_from_lerobot(folder, tmp_path / "back")):
+        with pytest.raises(ValueError, match=str(exported)):
+            load(exported)
+    assert not (tmp_path / "back").exists()
 
 
 def test_export_and_import_name_the_folder_that_does_not_fit(tmp_path):

@@ -190,6 +190,7 @@ def test_late_frames_and_chunks(recording, kind, tmp_path):
     [
         ({"supervision": "speed"}, "speed"),
         ({"kind": "transformer"}, "transformer"),
+        ({"architecture": "mlp"}, "architecture must be one of .*glimpse.*'mlp'"),
         ({"window_steps": 1}, "window_steps"),
         ({"delay": 20}, "delay"),
         ({"delay": -1}, "delay"),

@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from lerobot.robots import make_robot_from_config
+from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
 from dynmap_rl.envs.scene import scene_seed
 from dynmap_rl.integrations.lerobot import DynmapRobotConfig, robot
@@ -61,6 +62,18 @@ def test_a_robot_sees_the_frame_at_the_beginning_of_its_step(played):
         clock[0] += 0.05 + 0.01 * (t % 3 - 1)  # small deviations do not matter
     assert made.over and made.held == 0
     assert made.info == info
+
+
+def test_a_robot_says_whether_it_is_connected(played, tmp_path):
+    made, _ = played
+    with pytest.raises(DeviceAlreadyConnectedError):
+        made.connect()
+    made.disconnect()
+    for call in (made.get_observation, lambda: send(made, ACTIONS[0])):
+        with pytest.raises(DeviceNotConnectedError):
+            call()
+    with pytest.raises(ValueError, match="robot.task must be one of balance_reaching"):
+        DynmapRobotConfig(task="mujoco:PlateSlide", calibration_dir=tmp_path)
 
 
 def test_a_robot_holds_its_pose_where_no_action_comes(played):

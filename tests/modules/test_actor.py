@@ -1,5 +1,7 @@
 """Actor and latent actor: step form against sequence form, memory, imagination."""
 
+import warnings
+
 import pytest
 import torch
 from small import CONSTANTS, make_model
@@ -146,6 +148,34 @@ def test_an_environment_that_does_not_pass_the_memory_on_is_refused(make):
     env = TransformedEnv(DynmapBatchedEnv(num_envs=2, from_pixels=True), InitTracker())
     with pytest.raises(KeyError, match="make_tensordict_primer"):
         env.rollout(3, make())
+
+
+@pytest.mark.parametrize("make", [make_actor, lambda: LatentActor(make_actor().policy)])
+def test_an_actor_without_memory_warns(make):
+    actor = make()
+    td = TensorDict(
+        {key: torch.zeros(2, size) for key, size in (("latent", 16), ("hidden1", 24), ("hidden2", 24))}, [2]
+    )
+    td = td.set("pixels", torch.zeros(2, 3, 64, 64, dtype=torch.uint8)).set("goal", torch.zeros(2, 2))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(2):  # episodes of two steps, whose first has no memory yet
+            after = actor(td.copy())["next"]
+            actor(td.copy().update(after))
+            actor(td.copy().set("is_init", torch.ones(2, 1, dtype=torch.bool)))
+    actor(td.copy())
+    with pytest.warns(UserWarning, match="make_tensordict_primer"):
+        actor(td.copy())
+
+
+@pytest.mark.parametrize("kind", ["feedforward", "recurrent"])
+def test_a_goal_of_another_type_is_the_same_goal(kind):
+    frames = make_frames()[:, 0]
+    actions = [
+        make_actor(kind)(frames.copy().set("goal", frames["goal"].to(t)))["action"]
+        for t in (torch.float64, None)
+    ]
+    torch.testing.assert_close(*actions)
 
 
 def test_windows_are_refused_in_recurrent_mode():

@@ -100,6 +100,14 @@ def test_an_earlier_step_begins_a_new_episode():
     assert not torch.allclose(chunks.act(pixels[1], goal, step=9), first)
 
 
+def test_a_step_beyond_the_last_chunk_may_be_repeated():
+    actor, (pixels, goal) = make_actor("recurrent"), draw(2)
+    chunks = ChunkActor(actor, size=5)
+    for step in (0, 10):
+        last = chunks.act(pixels[0], goal, step=step)
+    assert torch.equal(chunks.act(pixels[0], goal, step=10), last)
+
+
 @pytest.mark.parametrize(("size", "delay"), [(4, 4), (4, -1), (0, 0)])
 def test_a_delay_must_be_shorter_than_a_chunk(size, delay):
     with pytest.raises(ValueError, match="delay must be between 0 and size - 1"):

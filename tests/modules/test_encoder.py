@@ -18,6 +18,7 @@ def test_encoder_keeps_leading_axes_and_refuses_other_frames(make):
     assert latent.shape == (2, 3, 16)
     torch.testing.assert_close(encoder(frames[0, 0]), latent[0, 0], rtol=1e-4, atol=1e-5)
     torch.testing.assert_close(encoder(frames.float()), latent, rtol=1e-4, atol=1e-5)
+    assert encoder(frames[:0]).shape == (0, 3, 16) and encoder(frames[:0].float()).shape == (0, 3, 16)
     with pytest.raises(ValueError, match="32, 32"):
         encoder(torch.zeros(1, 3, 32, 32))
 

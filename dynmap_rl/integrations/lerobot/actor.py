@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import torch
+from draccus.utils import DraccusException
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.utils.constants import OBS_STATE
@@ -57,7 +58,7 @@ class LeRobotActor(TensorDictModuleBase):
             self.processors = make_pre_post_processors(
                 config, str(path), preprocessor_overrides={"device_processor": {"device": str(device)}}
             )
-        except (OSError, KeyError, ValueError, ImportError) as error:
+        except (OSError, KeyError, ValueError, ImportError, DraccusException) as error:
             reason = first_line(error)
             raise ValueError(
                 f"{path} must be a policy of LeRobot, but it cannot be loaded ({reason}); check the path"

@@ -11,6 +11,7 @@ from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 from dynmap_rl.keys import DYNAMICS, FRAME_SHAPE
 from dynmap_rl.modules.checkpoints import check_policy
 from dynmap_rl.modules.supervision import parse_supervision
+from dynmap_rl.modules.world_model import ARCHITECTURES
 
 GOAL = 2  # entries of the goal, x and y
 
@@ -28,7 +29,7 @@ class DynmapConfig(PreTrainedConfig):
         kind: ``recurrent`` or ``feedforward`` policy.
         latent_size: Z of the world model.
         hidden_size: H of the world model.
-        architecture: ``glimpse``, ``plain``, ``resnet18`` or ``vit`` (see :class:`dynmap_rl.modules.WorldModel`).
+        architecture: ``glimpse``, ``plain``, ``resnet18``, ``resnet18_imagenet`` or ``vit`` (see :class:`dynmap_rl.modules.WorldModel`).
         width: width of the policy; 0 for its default.
         window_steps: steps of a training window.
         rgb_frames: decoded frames of a batch.
@@ -88,6 +89,10 @@ class DynmapConfig(PreTrainedConfig):
         super().__post_init__()
         parse_supervision(self.supervision)
         check_policy(self.kind)
+        if self.architecture not in ARCHITECTURES:
+            raise ValueError(
+                f"--policy.architecture must be one of {', '.join(ARCHITECTURES)}, got {self.architecture!r}"
+            )
         if self.window_steps < 2:
             raise ValueError(f"--policy.window_steps must be at least 2, got {self.window_steps}")
         if not 0 <= self.delay < self.chunk_size:

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
+from draccus.utils import DraccusException
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.utils.constants import ACTION, OBS_STATE
+from safetensors import SafetensorError
 
 from dynmap_rl.keys import CAMERA, FRAME_SHAPE
-from dynmap_rl.modules.checkpoints import save_policy, save_world_model
+from dynmap_rl.modules.checkpoints import load_world_model, save_policy, save_world_model
 from dynmap_rl.runs.lookup import find_run, load_actor
 from dynmap_rl.utils.files import read_json, write_json
+from dynmap_rl.utils.hub import first_line
+from dynmap_rl.utils.weights import fingerprint
 
 from .configuration_dynmap import DynmapConfig
 from .modeling_dynmap import DynmapPolicy
@@ -75,7 +80,8 @@ def import_from_lerobot(folder: str | Path, run: str | Path, seed: int = 0) -> P
 
     Args:
         folder: written by :func:`export_to_lerobot` or by ``lerobot-train --policy.type=dynmap``.
-        run: run folder; gets ``world_model`` and ``seed_N/policy``.
+        run: run folder; gets ``world_model`` and ``seed_N/policy``. Where it has another world model already, of another
+            training with LeRobot, the policy's own is ``seed_N/world_model``.
         seed: seed under which the policy is stored.
 
     Returns:
@@ -87,16 +93,25 @@ def import_from_lerobot(folder: str | Path, run: str | Path, seed: int = 0) -> P
     folder, run = Path(folder), Path(run)
     if not (folder / "config.json").exists():
         raise ValueError(f"{folder} holds no LeRobot policy (no config.json)")
-    config = DynmapConfig.from_pretrained(folder)
+    try:
+        config = DynmapConfig.from_pretrained(folder)
+    except DraccusException as error:
+        raise ValueError(f"{folder} holds no policy dynmap ({first_line(error)})") from error
     if not isinstance(config, DynmapConfig):
         raise ValueError(f"{folder} must hold a policy of the type dynmap, got {config.type}")
     source = config.source or {}
     settings = {"task": config.task} | ({"dataset": source["dataset"]} if "dataset" in source else {})
     if (run / "config.json").exists() and read_json(run / "config.json") != settings:
         raise ValueError(f"{run} holds another run; choose another folder")
-    policy = DynmapPolicy.from_pretrained(folder, config=config, strict=True)
+    try:
+        policy = DynmapPolicy.from_pretrained(folder, config=config)
+    except (OSError, SafetensorError) as error:
+        raise ValueError(f"{folder} holds no weights that can be read ({first_line(error)})") from error
     write_json(run / "config.json", settings)
-    save_world_model(run / "world_model", policy.world_model)
+    first, own = run / "world_model", run / f"seed_{seed}" / "world_model"
+    shutil.rmtree(own, ignore_errors=True)
+    shared = not first.exists() or fingerprint(load_world_model(first)) == fingerprint(policy.world_model)
+    save_world_model(first if shared else own, policy.world_model)
     save_policy(run / f"seed_{seed}" / "policy", policy.policy, policy.world_model)
     if source:
         write_json(run / "eval.json", {"world_model": source, "imported_from": str(folder)})

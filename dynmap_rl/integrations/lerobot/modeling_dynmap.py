@@ -17,6 +17,7 @@ from dynmap_rl.data.settings import Augmentation
 from dynmap_rl.envs.world import ACTION_LIMIT
 from dynmap_rl.keys import DYNAMICS
 from dynmap_rl.modules.actor import Actor
+from dynmap_rl.modules.backbones import load_imagenet
 from dynmap_rl.modules.checkpoints import make_policy, make_world_model
 from dynmap_rl.modules.chunk_actor import ChunkActor
 from dynmap_rl.modules.delayed_actor import DelayedActor
@@ -24,6 +25,7 @@ from dynmap_rl.modules.precision import mixed_precision
 from dynmap_rl.modules.supervision import parse_supervision
 from dynmap_rl.objectives.joint import JointLoss
 from dynmap_rl.objectives.world_model import WorldModelLoss
+from dynmap_rl.utils.hub import first_line
 
 from .columns import is_symmetric, read_columns
 from .configuration_dynmap import GOAL, DynmapConfig
@@ -80,9 +82,22 @@ class DynmapPolicy(PreTrainedPolicy):
                 self.register_buffer(name, columns["dynamics", name], persistent=False)
         sizes = config.latent_size, config.hidden_size, config.architecture
         self.world_model = make_world_model(constants, parse_supervision(config.supervision), *sizes)
+        if dataset_meta is not None and config.architecture == "resnet18_imagenet":
+            load_imagenet(self.world_model.encoder)
         width = {"width": config.width} if config.width else {}
         self.policy = make_policy(constants, config.kind, self.world_model, **width)
         self.reset()
+
+    @classmethod
+    def _load_as_safetensor(cls, model, model_file, map_location, strict):
+        """Load all weights, or raise ``ValueError``; LeRobot's default would leave random ones where some are missing."""
+        try:
+            return super()._load_as_safetensor(model, model_file, map_location, strict=True)
+        except RuntimeError as error:
+            raise ValueError(
+                f"{model_file} has weights of another architecture ({first_line(error)}); leave out options such as "
+                "--policy.kind and --policy.supervision, which are those of the checkpoint"
+            ) from error
 
     def get_optim_params(self):
         """Return the parameters to optimise."""

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from lerobot.robots import Robot, RobotConfig
+from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
 
 from dynmap_rl.envs.task import LAYOUT
 from dynmap_rl.envs.world import CONTROL_DT
-from dynmap_rl.keys import CAMERA, FRAME_SHAPE
+from dynmap_rl.keys import CAMERA, FRAME_SHAPE, GYMNASIUM_IDS
 
 from .environment import DynmapEnvConfig, make_env
 
@@ -34,6 +35,11 @@ class DynmapRobotConfig(RobotConfig):
     task: str = "balance_reaching"
     split: str = "test"
     scene: int = 0
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.task not in GYMNASIUM_IDS:
+            raise ValueError(f"--robot.task must be one of {', '.join(GYMNASIUM_IDS)}, got {self.task!r}")
 
 
 class DynmapRobot(Robot):
@@ -83,6 +89,7 @@ class DynmapRobot(Robot):
     def configure(self) -> None:
         """Do nothing, as there is nothing to configure."""
 
+    @check_if_already_connected
     def connect(self, calibrate: bool = True) -> None:
         """Begin the episode."""
         settings = DynmapEnvConfig(task=self.config.task, split=self.config.split)
@@ -97,12 +104,14 @@ class DynmapRobot(Robot):
             self._env.close()
             self._env = None
 
+    @check_if_not_connected
     def get_observation(self) -> dict:
         """Return state and frame at the beginning of the present step."""
         self._hold_until(time.perf_counter())
         values = [max(self._sent - 1, 0), *self._seen["agent_pos"].tolist()]
         return dict(zip(STATE, map(float, values), strict=True)) | {FRONT: self._seen["pixels"]}
 
+    @check_if_not_connected
     def send_action(self, action: dict) -> dict:
         """Begin a step with an action (m, m, rad)."""
         now = time.perf_counter()
