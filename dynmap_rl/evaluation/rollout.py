@@ -22,6 +22,7 @@ from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.modules.actor import Actor
 from dynmap_rl.modules.delayed_actor import DelayedActor
+from dynmap_rl.modules.policy import FeedforwardPolicy, RecurrentPolicy
 
 from .still import reuse_still_frames
 
@@ -90,10 +91,11 @@ def check_actor(actor: Callable, task: BaseTask) -> None:
     policy = (actor.actor if isinstance(actor, DelayedActor) else actor).latent_actor.policy
     own = {
         "action": (world_model.transition.action.size, len(layout.action)),
-        "goal": (policy.goal.size, layout.goal_size),
         "frame side": (world_model.image_size, layout.image_size),
         "cameras": (world_model.cameras, len(layout.cameras)),
     }
+    if isinstance(policy, FeedforwardPolicy | RecurrentPolicy):  # others may have a goal of another form
+        own["goal"] = policy.goal.size, layout.goal_size
     wrong = [f"{name} {found} instead of {size}" for name, (found, size) in own.items() if found != size]
     if wrong:
         raise ValueError(f"the policy must be of {task.name}, got another one: {', '.join(wrong)}")

@@ -66,7 +66,10 @@ class RobotActor:
             ValueError: the goal has another size than the policy's, or is not finite.
         """
         goal = torch.as_tensor(goal, dtype=torch.float32, device=self.device)
-        size = self.actor.actor.latent_actor.policy.goal.size
+        policy = self.actor.actor.latent_actor.policy
+        size = (
+            policy.goal.size if hasattr(policy, "goal") else goal.numel()
+        )  # a policy of one's own may have none
         if goal.shape != (size,) or not goal.isfinite().all():
             raise ValueError(f"goal must be {size} finite numbers, got {goal.tolist()}")
         self.goal, self.unused = goal, 0
