@@ -154,8 +154,7 @@ def load_policy(config: Config, folder: Path, instruction: str):
         ) from error
     refuse(config, Config(), ["seed"], "a LeRobot policy")
     torch.set_num_threads(config.compute.threads)
-    device = choose_device(config.compute.device)
-    return LeRobotActor(config.policy, device, instruction=instruction)
+    return LeRobotActor(config.policy, choose_device(config.compute.device), instruction=instruction)
 
 
 def judge_expert(config: Config) -> tuple[Path, str, dict]:

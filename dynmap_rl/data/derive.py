@@ -14,6 +14,7 @@ from dynmap_rl.envs.task import BODIES, LAYOUT
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.keys import DYNAMICS, FOUND
 
+from .angles import align_axes, align_turns
 from .camera import FrameSource, choose_view, read_motion
 from .demonstrations import DERIVED, META, find_layout, find_meta
 from .format.columns import write_columns
@@ -24,7 +25,6 @@ from .quality import Derived, judge_quality
 from .state import choose_state, read_state
 
 METHODS = ("central", "savgol")
-ELONGATED = 1.3  # length to width of an object whose longest axis is known
 SOURCES = "state", "centroid", "tracks", "flow", "state,tracks", "state,flow"
 
 
@@ -101,9 +101,9 @@ def add_dynamics(
     The columns (float32) are computed for one episode at a time, in float64, with the times of the column ``timestamp``.
     From frames there is also ``dynamics.found`` (bool): whether what an entry belongs to was found in the frame. Other
     positions are interpolated, and trainings leave these entries out. The new folder appears when it is complete. Videos
-    are hard-linked where the file system can; all other files are copied. A recording of a task stays one, and can be trained on with the recipes of the tasks: its constants of
-    normalisation and the names of its dynamics are written anew. ``meta/dynamics.json`` has all settings, and
-    the quality of the columns.
+    are hard-linked where the file system can; all other files are copied. A recording of a task stays one, and can be
+    trained on with the recipes of the tasks: its constants of normalisation and the names of its dynamics are written anew.
+    ``meta/dynamics.json`` has all settings, and the quality of the columns.
 
     Args:
         dataset: local folder or hub id.
@@ -221,40 +221,6 @@ def _derive(
         velocity = motion.velocity
         acceleration = differentiate(velocity, time, method, window, order)[0]
     return {"position": position, "velocity": velocity, "acceleration": acceleration}, motion.light()
-
-
-def align_turns(angle: np.ndarray, rows: list[slice], period: float) -> None:
-    """Shift episodes of unwrapped angles ``[N, D]`` in place by whole turns, so that a pose has one value in all of them.
-
-    The mean of each episode is moved to within half a turn of the mean direction of all.
-    """
-    center = _direction(angle, period)
-    for own in rows:
-        angle[own] -= period * np.round((angle[own].mean(0) - center) / period)
-
-
-def align_axes(angle: np.ndarray, episodes: list[tuple[slice, Motion]]) -> None:
-    """Shift episodes of the angles of tracked objects ``[N, objects]`` in place, so that a pose has one value in all of them.
-
-    The longest axis of an object has no direction. Its angle is counted from the horizontal or the vertical of the picture,
-    whichever is nearer at the start of most episodes, and begins within a quarter of a turn of it; within an eighth for an
-    object that is less than :data:`ELONGATED` times as long as wide.
-    """
-    for n, column in enumerate(angle.T):
-        found = [np.flatnonzero(motion.found[:, n])[:5] for _, motion in episodes]
-        start = np.array(
-            [np.median(column[own][seen]) for (own, _), seen in zip(episodes, found, strict=True)]
-        )
-        long = np.median([motion.tracks.elongation[n] for _, motion in episodes]) > ELONGATED
-        period = np.pi if long else np.pi / 2
-        axis = np.pi / 2 * np.round(_direction(start, period) / (np.pi / 2))
-        for (own, _), first in zip(episodes, start, strict=True):
-            column[own] -= axis + period * np.round((first - axis) / period)
-
-
-def _direction(angle: np.ndarray, period: float) -> np.ndarray:
-    """Return the mean direction of angles over the first dimension."""
-    return np.angle(np.exp(2j * np.pi * angle / period).mean(0)) * period / (2 * np.pi)
 
 
 def _check_lengths(root: Path, rows: dict[int, slice], methods: list[str], window: int) -> None:

@@ -59,9 +59,9 @@ def layout_constants(episodes: TensorDictBase, layout: Layout) -> dict[str, dict
     """Compute the range of every quantity of the bodies of a task that is not in the plane.
 
     The three entries of a point or a vector, where all come in threes, share the width of their ranges, which holds all
-    but one in a thousand of the values at either end, and is at least 0.1 m, 0.2 m/s and 2 m/s^2, or 2 rad/s and 20 rad/s^2. So a body that hardly
-    moves along an axis, or hardly turns, does not have its noise enlarged. Axes of bodies and actions have their natural
-    ranges.
+    but one in a thousand of the values at either end, and is at least 0.1 m, 0.2 m/s and 2 m/s^2, or 2 rad/s and
+    20 rad/s^2. So a body that hardly moves along an axis, or hardly turns, does not have its noise enlarged. Axes of bodies
+    and actions have their natural ranges.
 
     Args:
         episodes: ``[E, T]`` training episodes, as :func:`dynmap_rl.data.load_dataset` returns them.

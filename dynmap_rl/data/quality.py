@@ -54,8 +54,8 @@ LIMITS = {
     ),
     "residual_angle": (
         0.07, True, "distance of an angle from a smooth trajectory, root mean square (rad)",
-        "film from nearer, or use --point true for tracks without angles, which a round object has none of; only velocities "
-        "gain by --method savgol with a longer --window",
+        "film from nearer, or use --point true for tracks without angles: a round object has none; only velocities gain by "
+        "--method savgol with a longer --window",
     ),
     "agreement": (
         0.7, False, "correlation of the tracks' velocity with that of the optical flow",

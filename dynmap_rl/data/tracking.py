@@ -147,7 +147,8 @@ def track_objects(
     )
     cut = np.array([[region[2] for region in row] for row in regions]) & found
     for n in range(objects):
-        pose[:, n, 2] = _straighten(pose[:, n, 2], found[:, n])
+        seen = found[:, n]
+        pose[seen, n, 2] = np.unwrap(pose[seen, n, 2], period=np.pi)  # an axis has no direction
         pose[:, n] = fill_gaps(pose[:, n], found[:, n])
     order = range(objects) if colors else _order(sort, pose, area, found, frames, labels)
     numbers = np.zeros(objects + 1, np.uint8)
@@ -269,13 +270,6 @@ def _measure(labels: np.ndarray, n: int) -> tuple[tuple[float, float, float], in
     left, top, width, height, area = stats[largest]
     cut = left == 0 or top == 0 or left + width == mask.shape[1] or top + height == mask.shape[0]
     return (x, y, angle), int(area), bool(cut), float(np.sqrt((both + apart) / max(both - apart, 1e-9)))
-
-
-def _straighten(angle: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """Unwrap angles of an axis, which has no direction, and begin within a quarter of a turn of 0."""
-    angle = angle.copy()
-    angle[found] = np.unwrap(angle[found], period=np.pi)
-    return angle - np.pi * np.round(np.median(angle[found][:5]) / np.pi)
 
 
 def _order(sort: str, pose, area, found, frames, labels) -> list[int]:

@@ -118,9 +118,8 @@ def _bin_cause(episode: TensorDictBase) -> str:
         return "keeps the block"
     ranges = BinRanges()
     x, y = (episode["dynamics", "position"][-1, 3:5] - episode["goal"][0]).tolist()
-    inside = (
-        abs(x) < ranges.bin_width[1] / 2 and -ranges.bin_depth[1] < y < 0
-    )  # the goal is in the bin's opening
+    # The goal is in the bin's opening.
+    inside = abs(x) < ranges.bin_width[1] / 2 and -ranges.bin_depth[1] < y < 0
     return "in the bin, but touched or moving" if inside else "drops beside the bin"
 
 

@@ -187,10 +187,9 @@ def episode_rows(episodes: TensorDict, seeds: list[int]) -> list[dict]:
         for i, seed in enumerate(seeds)
     ]
     truth, predicted = (episodes[key].get("position", None) for key in ("dynamics", "predicted_dynamics"))
-    axes = episodes["goal"].shape[-1]  # the goal is a point in the plane or in space
-    if (
-        predicted is not None and predicted.shape == truth.shape and axes in (2, 3)
-    ):  # it may know other entries
+    axes = episodes["goal"].shape[-1]
+    # A world model may know other entries, and the goal of a task of one's own may be no point.
+    if predicted is not None and predicted.shape == truth.shape and axes in (2, 3):
         error = predicted - truth
         error = error[:, 1:, :axes].norm(dim=-1)  # [E, T - 1]
         away = (truth[..., :axes] - episodes["goal"])[:, 1:].norm(dim=-1) > 0.1

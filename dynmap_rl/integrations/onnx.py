@@ -52,7 +52,7 @@ def export_to_onnx(run: str | Path, folder: str | Path, seed: int = 0) -> Path:
     from dynmap_rl.runs.lookup import load_actor
 
     actor, folder, batch = load_actor(run, seed).eval(), Path(folder), torch.export.Dim("batch")
-    temporary = folder.with_name(f"{folder.name}.tmp")  # parts of two exports would fit together
+    temporary = folder / ".tmp"  # parts of two exports would fit together
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir(parents=True)
     for part, (function, sizes, outputs) in _list_parts(actor).items():
@@ -71,7 +71,6 @@ def export_to_onnx(run: str | Path, folder: str | Path, seed: int = 0) -> Path:
                 dynamic_shapes=(tuple({0: batch} for _ in inputs),),
             )
         program.save(temporary / f"{part}.onnx")
-    folder.mkdir(exist_ok=True)
     for path in temporary.iterdir():
         path.replace(folder / path.name)
     temporary.rmdir()

@@ -67,9 +67,8 @@ class RobotActor:
         """
         goal = torch.as_tensor(goal, dtype=torch.float32, device=self.device)
         policy = self.actor.actor.latent_actor.policy
-        size = (
-            policy.goal.size if hasattr(policy, "goal") else goal.numel()
-        )  # a policy of one's own may have none
+        # A policy of one's own may not say how large its goal is.
+        size = policy.goal.size if hasattr(policy, "goal") else goal.numel()
         if goal.shape != (size,) or not goal.isfinite().all():
             raise ValueError(f"goal must be {size} finite numbers, got {goal.tolist()}")
         self.goal, self.unused = goal, 0

@@ -99,7 +99,7 @@ class Session:
         self.driver, self.person = "policy" if actor else "person", Person()
         if actor:
             check_actor(actor, self.task)
-        self.delay = -1
+        self.delay: int | None = None
         self.set_delay(delay)
 
     def set_delay(self, delay: int) -> None:

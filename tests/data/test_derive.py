@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from dynmap_rl.data.derive import _derive, align_axes, align_turns, differentiate
+from dynmap_rl.data.angles import align_axes, align_turns
+from dynmap_rl.data.derive import _derive, differentiate
 from dynmap_rl.data.motion import Motion
 from dynmap_rl.data.tracking import Tracks
 

@@ -113,3 +113,9 @@ def test_only_the_block_between_the_marks_is_replaced(tmp_path, monkeypatch):
     (tmp_path / "README.md").write_text(text)
     assert write_results_page(tmp_path / "results", tmp_path / "README.md") == [tmp_path / "README.md"]
     assert write_results_page(tmp_path / "results", tmp_path / "README.md") == []
+
+
+def test_commands_of_results_name_no_place_of_one_machine():
+    files = [*RESULTS.rglob("*.json")]
+    named = [str(file) for file in files if re.search(r'"command": "[^"]*[ =]/', file.read_text())]
+    assert len(files) > 100 and not named

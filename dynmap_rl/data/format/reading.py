@@ -54,8 +54,7 @@ def find_dataset(dataset: str | Path) -> Path:
         reason = first_line(error)
         raise ValueError(
             f"no dataset at {dataset}, neither as a folder, nor in {HF_LEROBOT_HOME}, nor with the tag {LEROBOT_VERSION} on "
-            f"the hub ({reason}); "
-            "check the name and the network, or record one with recipes/collect.py"
+            f"the hub ({reason}); check the name and the network, or record one with recipes/collect.py"
         ) from error
 
 

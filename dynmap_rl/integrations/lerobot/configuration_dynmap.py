@@ -29,7 +29,8 @@ class DynmapConfig(PreTrainedConfig):
         kind: ``recurrent`` or ``feedforward`` policy.
         latent_size: Z of the world model.
         hidden_size: H of the world model.
-        architecture: ``glimpse``, ``plain``, ``resnet18``, ``resnet18_imagenet`` or ``vit`` (see :class:`dynmap_rl.modules.WorldModel`).
+        architecture: ``glimpse``, ``plain``, ``resnet18``, ``resnet18_imagenet`` or ``vit`` (see
+            :class:`dynmap_rl.modules.WorldModel`).
         width: width of the policy; 0 for its default.
         window_steps: steps of a training window.
         rgb_frames: decoded frames of a batch.
