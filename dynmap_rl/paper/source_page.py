@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 
 from dynmap_rl.envs.tasks import get_task
@@ -9,6 +10,7 @@ from dynmap_rl.utils.files import read_json, write_bytes
 
 from .source_results import (
     data_table,
+    gap_table,
     plot_data,
     plot_measures,
     plot_sources,
@@ -17,7 +19,7 @@ from .source_results import (
     source_table,
 )
 from .sources import POLICIES, SOURCES
-from .tables import join_table, p_text
+from .tables import commits_text, join_table, p_text
 
 FORMS = {"glimpse": "the default encoder and decoder", "plain": "a plain CNN"}
 
@@ -33,7 +35,7 @@ def write_source_page(results: Path, tasks: list[str], architecture: str = "glim
     parts = [
         "# Sources of dynamics, and numbers of demonstrations",
         f"World models have {FORMS[architecture]}. SR in % with 95 % intervals over the test scenes, which do not cover "
-        "differences between trainings. Share of the gain: (SR - SR of Only-RGB) / (SR with the simulator's dynamics - SR "
+        "differences between trainings; those of the differences from the simulator's dynamics are over world models. Share of the gain: (SR - SR of Only-RGB) / (SR with the simulator's dynamics - SR "
         "of Only-RGB). Policies of rows with 15 copies are also trained on the states of 15 augmented copies of every "
         "demonstration. Measures are means over the world models that have been probed. Derived "
         "columns have the verdict of `add_dynamics.py`, before any training, with the checks that failed. Written by "
@@ -43,7 +45,7 @@ def write_source_page(results: Path, tasks: list[str], architecture: str = "glim
     for task in tasks:
         if not any(read_source(results, task, source, policy) for source in SOURCES for policy in POLICIES):
             continue
-        parts += [f"## {task}", source_table(results, task)]
+        parts += [f"## {task}", source_table(results, task), gap_table(results, task)]
         rows = [
             [name, f"{row['rho']:.2f}", p_text(row["p"]), str(row["sources"])]
             for name, row in rank_correlations(results, task).items()
@@ -57,12 +59,16 @@ def write_source_page(results: Path, tasks: list[str], architecture: str = "glim
     written.append(results / "data.png")
     plot_data(results, "balance_reaching", written[-1])
     parts += ["## Number of demonstrations", data_table(results, "balance_reaching"), "![data](data.png)"]
-    commands = {read_json(path)["command"] for path in results.glob("*.json")}
-    commands = sorted(commands, key=lambda command: ("--pretrained" in command, command))
+    found = [read_json(path) for path in sorted(results.glob("*.json"))]
+    commits = commits_text(Counter(result["commit"] for result in found))
+    commands = sorted(
+        {result["command"] for result in found}, key=lambda command: ("--pretrained" in command, command)
+    )
     form = "" if architecture == "glimpse" else f" --architecture {architecture}"
     parts += [
         "## Commands",
-        f"`python recipes/paper/sources.py{form} --only SOURCE` also derives the dataset of a source.",
+        f"`python recipes/paper/sources.py{form} --only SOURCE` also derives the dataset of a source. Runs by commit: "
+        f"{commits}.",
         "\n".join(["```bash", *commands, "```"]),
     ]
     written.append(results / "README.md")

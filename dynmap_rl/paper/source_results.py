@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 
 from dynmap_rl.evaluation.probing import judge_states, probe
 from dynmap_rl.evaluation.protocol import result_rows
-from dynmap_rl.evaluation.statistics import shared_interval, summarize
+from dynmap_rl.evaluation.statistics import shared_interval, summarize, welch_interval
 from dynmap_rl.modules.world_model import WorldModel
 from dynmap_rl.reporting.figures import plt, save_figure
 from dynmap_rl.utils.files import read_json
@@ -144,6 +144,27 @@ def _rate(cell: dict | None, none: dict | None, full: dict | None) -> list[str]:
     share = f"{100 * (cell['SR'] - none['SR']) / gain:.0f} %" if gain > 0 else ""
     each = ", ".join(f"{rate:.1f}" for rate in cell["world_models"])
     return [f"**{cell['SR']:.1f}** [{low:.1f}, {high:.1f}]", each, share]
+
+
+def gap_table(results: Path, task: str) -> str:
+    """Return how many points of SR a source has more or less than the simulator's dynamics, in Markdown.
+
+    The 95 % intervals (Welch's t) are over world models and are left out where there are too few.
+    """
+    lines = []
+    for name, source in SOURCES.items():
+        gaps = []
+        for policy in POLICIES:
+            cell, full = (read_source(results, task, s, policy) for s in (name, "simulator"))
+            if not (cell and full and name != "simulator"):
+                gaps.append("")
+                continue
+            interval = welch_interval(cell["world_models"], full["world_models"])
+            gap = f"{float(np.mean(cell['world_models']) - np.mean(full['world_models'])):+.1f}"
+            gaps.append(f"{gap} [{interval[0]:+.1f}, {interval[1]:+.1f}]" if interval else gap)
+        if any(gaps):
+            lines.append([source.text, *gaps])
+    return join_table(["points of SR more than with the simulator's dynamics", *POLICIES], lines)
 
 
 def data_table(results: Path, task: str) -> str:

@@ -4,9 +4,10 @@ import pytest
 import torch
 from small import CONSTANTS, make_episodes, make_model
 
+from dynmap_rl.evaluation.statistics import welch_interval
 from dynmap_rl.modules.checkpoints import make_world_model
 from dynmap_rl.paper import source_results
-from dynmap_rl.paper.source_results import measure_world_model, rank_correlations
+from dynmap_rl.paper.source_results import gap_table, measure_world_model, rank_correlations
 from dynmap_rl.utils.files import write_json
 
 
@@ -68,12 +69,29 @@ def test_the_open_loop_error_is_that_of_the_step_after_the_horizon(short):
         assert changed == (step == 9), step
 
 
-def test_rank_correlations_are_over_the_sources(tmp_path):
+def write_result(path, successes):
+    """Write a result with this many successes of five episodes."""
     flags = {"dropped": "00000", "touched": "00000", "first_scene_seed": 0, "position_error": [0.01] * 5}
+    rows = flags | {"success": "1" * successes + "0" * (5 - successes)}
+    write_json(path, {"results": [{"test": {"rows": rows}}], "command": "python x.py"})
+
+
+def test_gaps_to_the_simulator_have_intervals_over_world_models(tmp_path):
+    for source, counts in {"simulator": (5, 4), "tracks": (3, 4), "none": (1,)}.items():
+        for seed, successes in enumerate(counts):
+            write_result(tmp_path / f"balance_reaching_{source}_world_model_{seed}_recurrent.json", successes)
+    low, high = welch_interval((60, 80), (100, 80))
+    lines = gap_table(tmp_path, "balance_reaching").splitlines()[2:]
+    assert lines == [
+        "| none (Only-RGB) | -70.0 |  |",
+        f"| frames: tracks | -20.0 [{low:+.1f}, {high:+.1f}] |  |",
+    ]
+
+
+def test_rank_correlations_are_over_the_sources(tmp_path):
     for count, source in enumerate(("none", "tracks", "flow", "command", "simulator")):
         name = f"balance_reaching_{source}_world_model_0_recurrent.json"
-        rows = flags | {"success": "1" * count + "0" * (5 - count)}
-        write_json(tmp_path / name, {"results": [{"test": {"rows": rows}}], "command": "python x.py"})
+        write_result(tmp_path / name, count)
         measures = {
             "probe_position": count**2,
             "probe_velocity": 1.0 - count,
