@@ -71,7 +71,7 @@ def main(config: Config) -> None:
     if config.policy:
         refuse(config, Config(), ["expert", "checkpoint"], "--policy")
     else:
-        names = ["seed", "trust_remote_code", "delay", "jitter", "lost", "delay_error", "stale"]
+        names = "seed", "trust_remote_code", "delay", "jitter", "lost", "delay_error", "stale"
         refuse(config, Config(), names, "an expert")
     torch.set_num_threads(1)  # networks are small, and threads would wait for each other
     folder, text, result = (judge_policy if config.policy else judge_expert)(config)
@@ -108,9 +108,9 @@ def judge_policy(config: Config) -> tuple[Path, str, dict]:
         if not isinstance(actor, Actor):
             raise ValueError("--policy must be a run for --delay; add --stale for a LeRobot policy")
         actor = DelayedActor(actor, max_delay=delay.longest)
-    workers = config.compute.threads if isinstance(actor, Actor | DelayedActor) else 1
-    result = evaluate(actor, task, config.eval, delay, workers=workers)["test"]
-    parts = [*Path(config.policy).parts[-4:], f"seed_{config.seed}"]
+    own = isinstance(actor, Actor | DelayedActor)
+    result = evaluate(actor, task, config.eval, delay, workers=config.compute.threads if own else 1)["test"]
+    parts = [*Path(config.policy).parts, *([f"seed_{config.seed}"] if own else [])]
     if delay:
         parts += ["_".join(map(str, ["delay", *astuple(delay)])), *(["stale"] if config.stale else [])]
         result |= {"delay": asdict(delay), "stale": config.stale}

@@ -62,10 +62,13 @@ def augment(
         if key in windows:
             windows[key] = windows[key] * sign
     windows["goal"] = windows["goal"] * sign[..., :2] + offset[..., :2]
-    entries = torch.arange(windows["dynamics", "position"].shape[-1], device=generator.device) % 3
-    dynamics = windows["dynamics"].apply(lambda x: x * sign[..., entries])
-    windows["dynamics"] = dynamics.set("position", dynamics["position"] + offset[..., entries])
-    return windows
+    dynamics = {}
+    for name, values in windows.get("dynamics", {}).items():
+        entries = torch.arange(values.shape[-1], device=generator.device) % 3
+        dynamics[name] = values * sign[..., entries]
+        if name == "position":
+            dynamics[name] = dynamics[name] + offset[..., entries]
+    return windows.set("dynamics", dynamics) if dynamics else windows
 
 
 def _orders(batch: int, generator: torch.Generator) -> torch.Tensor:

@@ -74,8 +74,9 @@ def _find_place(root: Path, cache: Path | None) -> Path:
 
 
 def hash_content(root: Path, settings: object = None) -> str:
-    """Return a name that depends on the settings and on every byte of the data files and of the metadata."""
+    """Return a name that depends on the settings and on every byte of ``meta/info.json``, of the data and of the videos."""
     files = [root / "meta/info.json", *sorted((root / "data").glob("*/*.parquet"))]
+    files += sorted((root / "videos").rglob("*.mp4"))
 
     def digest(path: Path) -> bytes:
         with open(path, "rb") as file:

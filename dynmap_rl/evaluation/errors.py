@@ -20,7 +20,7 @@ GROUPS = {"": (0, 1), "_angle": (2,)}  # entries of a body's dynamics (x, y, the
 def known_dynamics(episodes: TensorDictBase, quantity: str) -> torch.Tensor:
     """Return a quantity of the dynamics ``[E, T, D]``, NaN where ``labelled`` says that it is not known."""
     values, known = episodes["dynamics", quantity], episodes.get("labelled", None)
-    return values if known is None else values.where(known, torch.nan)
+    return values if known is None else values.where(known.reshape(*episodes.shape, -1), torch.nan)
 
 
 @torch.no_grad()

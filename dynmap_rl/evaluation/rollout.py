@@ -41,7 +41,8 @@ def roll_out(
 ) -> TensorDict:
     """Run one episode of T steps (120 of cart and block) for each scene; an episode goes on after a failure.
 
-    All episodes are one batch or, where a task limits its worlds, a few batches.
+    All episodes are one batch or, where a task limits its worlds, a few batches. What an actor draws with torch's generator
+    follows from the seeds.
 
     Args:
         actor: callable that reads ``pixels``, ``goal``, ``agent_pos`` or ``is_init`` of a TensorDict ``[E]`` and writes
@@ -77,7 +78,8 @@ def roll_out(
         full = some + seeds[: size - len(some)]  # a batch always has the same size
         plans = [Plan(seed, "", pushes=draw_pushes(seed, pushes)) for seed in full]
         still = reuse_still_frames(module) if device.type == "cpu" else nullcontext()
-        with evaluation_mode(module), still:
+        with evaluation_mode(module), still, torch.random.fork_rng([device] if device.type == "cuda" else []):
+            torch.manual_seed(some[0])
             episodes = _roll_out(actor, env, plans, keep_pixels, delay, title)
         parts.append(episodes[: len(some)])
     return torch.cat(parts)

@@ -17,10 +17,13 @@ from dynmap_rl.utils.ranks import first_rank_first, rank
 from dynmap_rl.utils.settings import flatten
 
 FORMAT = 2  # of config.json; the first release had flat settings
+UNTRAINED = {".lock", "config.json", "dataset.json"}  # files of a run that has failed before its training
 
 
 def open_run(folder: Path, config, *, ignore: tuple[str, ...] = ()) -> Path:
     """Create a run folder, or reopen it for the same settings, and lock it until this process ends.
+
+    A run that has not begun to train may get other settings.
 
     Of several processes that train together, the first creates and locks it.
 
@@ -44,7 +47,9 @@ def _open(folder: Path, config, ignore: tuple[str, ...]) -> Path:
         lock_folder(folder)
     settings = {"format": FORMAT, **plain_settings(config)}
     path = folder / "config.json"
-    if not path.exists():
+    untrained = {file.name for file in folder.iterdir()} <= UNTRAINED
+    if not path.exists() or (untrained and not rank()):
+        (folder / "dataset.json").unlink(missing_ok=True)
         write_json(path, settings)
         return folder
     stored = read_json(path)
@@ -116,6 +121,7 @@ def load_training_state(path: Path) -> dict | None:
 
     Raises:
         ValueError: the file is damaged.
+        OSError: the file cannot be opened.
     """
     import torch
 
@@ -124,11 +130,13 @@ def load_training_state(path: Path) -> dict | None:
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
         torch.set_rng_state(state.pop("rng"))
-        gpu = state.pop("gpu_rng", None)
-        if gpu is not None and torch.cuda.is_available():
-            torch.cuda.set_rng_state(gpu)
+    except (OSError, MemoryError):
+        raise
     except Exception as error:
         raise ValueError(f"{path} cannot be read ({error}); delete it to train from the start") from error
+    gpu = state.pop("gpu_rng", None)
+    if gpu is not None and torch.cuda.is_initialized():
+        torch.cuda.set_rng_state(gpu)
     return state
 
 

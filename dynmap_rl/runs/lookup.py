@@ -42,7 +42,7 @@ def find_run(run: str | Path) -> Path:
 
 def has_world_model(folder: Path) -> bool:
     """Return whether a folder is a run, and not a LeRobot policy."""
-    return (folder / "world_model").exists() or any(folder.glob("seed_*"))
+    return (folder / "world_model").exists() or any(folder.glob("seed_*/policy"))
 
 
 def load_actor(run: str | Path, seed: int = 0) -> Actor:

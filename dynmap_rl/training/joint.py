@@ -173,7 +173,7 @@ def train_seeds(
     """
     compute, folder = compute or Compute(), Path(folder)
     todo = [seed for seed in seeds if not (folder / f"seed_{seed}" / "eval.json").exists()]
-    threads = compute.threads if len(seeds) == 1 else 1
+    threads = compute.threads if len(seeds) == 1 or ranks() > 1 else 1
     work = _Work(
         load, folder, world_model, policy, settings, judge, compute.device, threads, logger, by_entry
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -14,7 +15,12 @@ from tqdm import tqdm
 from dynmap_rl.data.augmentation import augment
 from dynmap_rl.data.windows import check_length, sample_windows
 from dynmap_rl.modules.precision import mixed_precision
-from dynmap_rl.runs.folder import load_training_state, save_training_state, truncate_metrics
+from dynmap_rl.runs.folder import (
+    load_training_state,
+    plain_settings,
+    save_training_state,
+    truncate_metrics,
+)
 from dynmap_rl.runs.loggers import log_metrics
 from dynmap_rl.utils.ranks import mean_over_ranks, rank, ranks, translate_errors
 
@@ -53,8 +59,8 @@ def fit(
         save_every: updates between training states.
 
     Raises:
-        ValueError: the loss is not finite or diverges, or a batch cannot be divided among the processes; the last
-            training state is kept.
+        ValueError: the loss is not finite or diverges, a batch cannot be divided among the processes, or the folder
+            holds a training with other settings; the last training state is kept.
         OSError: another process has ended.
     """
     for update in (0, settings.updates - 1):
@@ -79,7 +85,12 @@ def fit(
     own = generator if ranks() == 1 else torch.Generator(device)
     loss_module = make_loss(own)
     start, first, path = 0, None, folder / "checkpoint" / "world_model.pt"
+    form = plain_settings(replace(settings, updates=1)) | {
+        "seed": seed
+    }  # a training may go on for more updates
     if state := load_training_state(path):
+        if state.get("form", form) != form or state["update"] > settings.updates:
+            raise ValueError(f"{folder} holds a training with other settings; choose another folder")
         model.load_state_dict(state["model"])
         optimizer.load_state_dict(state["optimizer"])
         start, first = state["update"], state["first_loss"]
@@ -116,6 +127,7 @@ def fit(
                 generator=generator.get_state(),
                 update=done,
                 first_loss=first,
+                form=form,
             )
 
 

@@ -37,7 +37,7 @@ def train_policy(
         held_out: held-out states, on which the plain L1 is logged.
         folder: gets ``metrics.jsonl``, whose lines after ``done`` are removed: a folder of its own.
         settings: sizes and learning rate; default :class:`PolicyTraining`.
-        seed: seed of the batches, and line of the progress bar.
+        seed: seed of the batches, and line of the progress bar (modulo 8).
         done: updates of an earlier training of this policy, after which the metrics go on.
         logger: ``tensorboard``, ``wandb``, ``trackio`` or None.
 
@@ -52,7 +52,7 @@ def train_policy(
     features, held_out = features.to(device), held_out.to(device)
     generator = torch.Generator(device).manual_seed(seed)
     loss_module, plain = ImitationLoss(policy, settings.emphasis), ImitationLoss(policy)
-    progress, first = tqdm(range(settings.updates), f"policy {seed}", position=seed), None
+    progress, first = tqdm(range(settings.updates), f"policy {seed}", position=seed % 8), None
     for update in progress:
         set_learning_rate(optimizer, settings.learning_rate, update, settings.updates)
         index = torch.randint(len(features), (settings.batch,), generator=generator, device=device)

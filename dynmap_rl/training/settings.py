@@ -81,10 +81,12 @@ class WorldModelTraining(WorldModelArchitecture):
             raise ValueError(
                 f"{type(self).__name__}.labelled must be above 0, got 0; supervision none uses no dynamics"
             )
-        if self.labelled < 1 and self.supervision == "none":
-            raise ValueError(
-                f"{type(self).__name__}.labelled has no effect with supervision none; leave it out"
-            )
+        idle = {"labelled", "beta_dynamics"} if self.supervision == "none" else set()
+        idle |= set() if self.beta_rgb else {"rarity"}
+        for name in sorted(idle):
+            if getattr(self, name) != getattr(type(self), name):
+                why = "supervision none" if name in ("labelled", "beta_dynamics") else "beta_rgb 0"
+                raise ValueError(f"{type(self).__name__}.{name} has no effect with {why}; leave it out")
         if not self.beta_rgb and self.supervision == "none":
             raise ValueError(
                 f"{type(self).__name__}.beta_rgb must be above 0 without supervision, got 0; nothing would be learned"

@@ -72,7 +72,9 @@ def train_world_model(
     train = episodes["train"]
     if settings.labelled < 1:
         chosen, found = choose_labelled(train, settings.labelled, settings.seed), train.get("labelled", None)
-        train = train.copy().set("labelled", chosen if found is None else chosen & found)
+        train = train.copy().set(
+            "labelled", chosen if found is None else chosen & found.reshape(*train.shape, -1)
+        )
     fit(
         world_model,
         lambda generator: make_loss(world_model, settings, generator),

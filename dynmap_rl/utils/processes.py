@@ -39,6 +39,8 @@ def run_processes(stages: Sequence[Callable[[tuple], None]], arguments: list[tup
         while running:
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 one, later = running.pop(future)
+                if running and (error := future.exception()):
+                    print(f"error: {error}; this ends when what runs beside it has ended", file=sys.stderr)
                 future.result()
                 if later:
                     running[pool.submit(later[0], one)] = one, later[1:]

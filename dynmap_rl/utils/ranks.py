@@ -27,6 +27,9 @@ def join_ranks(device: str = "auto") -> None:
 
     Args:
         device: see :func:`dynmap_rl.utils.devices.choose_device`.
+
+    Raises:
+        ValueError: there are fewer GPUs than processes.
     """
     if int(os.environ.get("WORLD_SIZE", 1)) == 1:
         return
@@ -39,6 +42,11 @@ def join_ranks(device: str = "auto") -> None:
         return
     gpu = choose_device(device).type == "cuda"
     if gpu:
+        here = int(os.environ["LOCAL_WORLD_SIZE"])
+        if here > torch.cuda.device_count():
+            raise ValueError(
+                f"{here} processes need as many GPUs, got {torch.cuda.device_count()}; add --compute.device cpu"
+            )
         torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(f"error: {DIED}"))  # torchrun ends the others
     distributed.init_process_group("nccl" if gpu else "gloo", timeout=TIMEOUT)

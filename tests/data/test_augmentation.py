@@ -99,6 +99,14 @@ def test_a_point_and_a_single_body_change_like_the_first_of_two_bodies(size):
     assert not torch.equal(out["dynamics", "position"], few["dynamics", "position"])
 
 
+def test_dynamics_that_are_missing_are_not_needed():
+    episodes = make_episodes()
+    out = augment(episodes.exclude(("dynamics", "position")), torch.Generator().manual_seed(2))
+    expected = augment(episodes, torch.Generator().manual_seed(2))
+    assert torch.equal(out["dynamics", "velocity"], expected["dynamics", "velocity"])
+    assert augment(episodes.exclude("dynamics"), torch.Generator())["goal"].shape == episodes["goal"].shape
+
+
 def test_frames_of_several_cameras_change_their_colours_alone():
     episodes = make_episodes()
     episodes["pixels"] = torch.cat([episodes["pixels"]] * 2, -1)

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from dynmap_rl.data import demonstrations
+from dynmap_rl.data.cache import hash_content
 from dynmap_rl.data.decoding import decode_episodes
 from dynmap_rl.data.demonstrations import load_dataset, load_demonstrations
 from dynmap_rl.data.format.reading import read_info
@@ -71,6 +72,15 @@ def test_a_changed_file_makes_the_cache_stale(copy, decoded):
     change_info(copy, lambda info: info["features"].pop("disturbed"))
     assert not load_dataset(copy)["disturbed"].any()
     assert decoded == [copy, copy] and old not in list_entries(copy) and len(list_entries(copy)) == 1
+
+
+def test_the_hash_of_a_dataset_is_that_of_its_videos_too(copy):
+    before, video = hash_content(copy), copy / "videos/observation.images.top/chunk-000/file-000.mp4"
+    video.parent.mkdir(parents=True)
+    video.write_bytes(b"frames")
+    first = hash_content(copy)
+    video.write_bytes(b"others")
+    assert len({before, first, hash_content(copy)}) == 3
 
 
 def test_an_interrupted_build_leaves_no_entry(copy, monkeypatch):

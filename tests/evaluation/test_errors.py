@@ -47,6 +47,8 @@ def test_dynamics_that_were_not_found_are_left_out(episodes):
     episodes["labelled"] = known
     episodes["dynamics", "position"][~known] = 1e6
     found = prediction_errors(model, episodes, batch=1, by_entry=True)
+    steps = episodes.clone().set("labelled", known[..., 1])  # one flag for all entries
+    assert prediction_errors(model, steps)["error_position"] > 1e3
     assert found["error_position_0"] == pytest.approx(error[..., 0][known[:, 1:, 0]].mean().item(), rel=1e-3)
     assert found["error_position_1"] == pytest.approx(error[..., 1].mean().item(), rel=1e-3)
     assert math.isnan(found["error_position_5"]), "never found"

@@ -71,6 +71,19 @@ def test_any_callable_is_rolled_out_from_any_seeds(seeds):
     assert evaluate(counter(), "balance_reaching", Evaluation(episodes=1, paper_episodes=0))
 
 
+def test_what_an_actor_draws_follows_from_the_scenes():
+    def act(td):
+        return TensorDict({"action": 0.01 * torch.randn(len(td), 3)}, td.batch_size)
+
+    first, state = roll_out(act, "balance_reaching", [3])["action"], torch.get_rng_state()
+    torch.rand(1)
+    torch.testing.assert_close(roll_out(act, "balance_reaching", [3])["action"], first)
+    assert not torch.equal(roll_out(act, "balance_reaching", [4])["action"], first)
+    torch.set_rng_state(state)
+    roll_out(act, "balance_reaching", [3])
+    assert torch.equal(torch.get_rng_state(), state), "the caller's generator is as before"
+
+
 def test_torchrl_s_lstm_is_rolled_out():
     lstm = LSTMModule(5, 8, in_key="agent_pos", out_key="x")
     actor = TensorDictSequential(lstm, TensorDictModule(torch.nn.Linear(8, 3), ["x"], ["action"]))

@@ -36,6 +36,7 @@ def test_a_run_reopens_with_the_same_settings_only(tmp_path):
     settings = Settings()
     for changed in (settings, settings, replace(settings, threads=6)):
         assert open_run(tmp_path / "run", changed, ignore=("threads",)) == tmp_path / "run"
+        append_metrics(tmp_path / "run", 1)
     changed = replace(settings, world_model=Group(updates=6), names=("a",))
     with pytest.raises(ValueError, match=r"names: .*, world_model\.updates: 5 there, 6 here\)"):
         open_run(tmp_path / "run", changed, ignore=("threads",))
@@ -45,8 +46,17 @@ def test_a_run_reopens_with_the_same_settings_only(tmp_path):
     assert read_json(tmp_path / "run/config.json")["world_model"] == {"updates": 5, "rate": 0.1}
 
 
+def test_a_run_that_has_not_begun_to_train_may_get_other_settings(tmp_path):
+    open_run(tmp_path, Settings())
+    write_json(tmp_path / "dataset.json", {"sha256": "of other data"})
+    open_run(tmp_path, Settings(names=("a",)))
+    assert read_json(tmp_path / "config.json")["names"] == ["a"]
+    assert not (tmp_path / "dataset.json").exists()
+
+
 def test_a_run_that_is_older_than_a_setting_has_its_default(tmp_path):
     open_run(tmp_path, Settings())
+    append_metrics(tmp_path, 1)
     stored = read_json(tmp_path / "config.json")
     del stored["world_model"]["rate"]
     write_json(tmp_path / "config.json", stored)
@@ -57,6 +67,7 @@ def test_a_run_that_is_older_than_a_setting_has_its_default(tmp_path):
 
 def test_a_run_of_the_first_release_is_refused(tmp_path):
     """Its settings were flat."""
+    append_metrics(tmp_path, 1)
     write_json(tmp_path / "config.json", {"run": "here", "updates": 5, "rate": 0.1})
     with pytest.raises(ValueError, match="another release.*--run"):
         open_run(tmp_path, Settings())
@@ -107,3 +118,10 @@ def test_a_damaged_training_state_is_named(tmp_path, damage):
     path.write_bytes(damage(path.read_bytes()))
     with pytest.raises(ValueError, match=r"state\.pt"):
         load_training_state(path)
+
+
+def test_a_training_state_that_cannot_be_opened_is_not_called_damaged(tmp_path):
+    """Advice to delete it would cost the training."""
+    (tmp_path / "state.pt").mkdir()
+    with pytest.raises(OSError):
+        load_training_state(tmp_path / "state.pt")

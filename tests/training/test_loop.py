@@ -41,6 +41,14 @@ def test_a_resumed_training_equals_an_uninterrupted_one(tmp_path, monkeypatch):
     assert read_metrics(tmp_path / "parts") == read_metrics(tmp_path / "whole")
 
 
+def test_a_folder_with_a_training_of_other_settings_is_refused(tmp_path):
+    """Otherwise its weights would be taken for those of the new settings."""
+    train_world_model(make_model(), make_episodes(), tmp_path, WORLD_MODEL)
+    for change in ({"beta_z": 0.9}, {"updates": 1}):
+        with pytest.raises(ValueError, match="other settings"):
+            train_world_model(make_model(), make_episodes(), tmp_path, replace(WORLD_MODEL, **change))
+
+
 def test_a_training_resumes_from_a_state_of_another_kind_of_device(tmp_path):
     """The generators of a GPU have states of another shape."""
     train_world_model(make_model(), make_episodes(), tmp_path, WORLD_MODEL)

@@ -59,9 +59,17 @@ def test_a_world_model_that_would_learn_nothing_is_refused():
         WorldModelTraining(supervision="none", beta_rgb=0)
 
 
-def test_labels_without_supervision_are_refused():
-    with pytest.raises(ValueError, match="labelled has no effect"):
-        WorldModelTraining(supervision="none", labelled=0.5)
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"labelled": 0.5, "supervision": "none"},
+        {"beta_dynamics": 2.0, "supervision": "none"},
+        {"rarity": 0.0, "beta_rgb": 0.0},
+    ],
+)
+def test_a_value_without_effect_is_refused(values):
+    with pytest.raises(ValueError, match=f"{next(iter(values))} has no effect"):
+        WorldModelTraining(**values)
 
 
 def test_torch_is_not_imported():

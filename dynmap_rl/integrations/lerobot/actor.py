@@ -61,7 +61,8 @@ class LeRobotActor(TensorDictModuleBase):
         except (OSError, KeyError, ValueError, ImportError, DraccusException) as error:
             reason = first_line(error)
             raise ValueError(
-                f"{path} must be a policy of LeRobot, but it cannot be loaded ({reason}); check the path"
+                f"{path} must be a policy of LeRobot, but it cannot be loaded ({reason}); name the folder "
+                "pretrained_model of a checkpoint, or the id of a policy"
             ) from error
         if cut and config.n_obs_steps != 1:
             raise ValueError(
