@@ -87,7 +87,7 @@ class WorldModel(nn.Module):
 
         Args:
             pixels: frames, 0..255.
-            mixed: use the precision of training (:func:`mixed_precision`), up to three times as fast.
+            mixed: use the precision of training (:func:`mixed_precision`), which is faster.
         """
         if not mixed:
             return self.encoder(pixels)

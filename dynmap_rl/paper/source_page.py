@@ -67,7 +67,8 @@ def write_source_page(results: Path, tasks: list[str], architecture: str = "glim
     form = "" if architecture == "glimpse" else f" --architecture {architecture}"
     parts += [
         "## Commands",
-        f"`python recipes/paper/sources.py{form} --only SOURCE` also derives the dataset of a source. Runs by commit: "
+        f"`python recipes/paper/sources.py{form} --tasks TASK --only SOURCE` also derives the dataset of a source. "
+        f"Runs by commit: "
         f"{commits}.",
         "\n".join(["```bash", *commands, "```"]),
     ]
