@@ -31,6 +31,7 @@ def fake_script(calls):
         result = {
             "results": [{"test": {"rows": rows | {"position_error": [0.01] * 3}}}],
             "command": "python x.py",
+            "commit": "0" * 12,
         }
         write_json(folder / given["--run"] / "eval.json", result)
         return 0
@@ -111,7 +112,7 @@ def test_cells_of_the_plain_architecture_differ_in_the_training_of_their_world_m
 def test_runs_of_the_tables_are_not_repeated(calls, tmp_path):
     rows = {"success": "1", "dropped": "0", "touched": "0", "first_scene_seed": 0, "position_error": [0.01]}
     for policy in ("recurrent", "feedforward"):
-        result = {"results": [{"test": {"rows": rows}}], "command": policy}
+        result = {"results": [{"test": {"rows": rows}}], "command": policy, "commit": "0" * 12}
         write_json(tmp_path / f"cells/{TASK}_plain_none_{policy}_world_model_1.json", result)
     only = "--part", "table", "--only", "none", "--world_models", "1", "--tables", "cells"
     plain = run(tmp_path, *only, "--architecture", "plain", "--dry_run").stdout
