@@ -35,7 +35,8 @@ def write_source_page(results: Path, tasks: list[str], architecture: str = "glim
     parts = [
         "# Sources of dynamics, and numbers of demonstrations",
         f"World models have {FORMS[architecture]}. SR in % with 95 % intervals over the test scenes, which do not cover "
-        "differences between trainings; those of the differences from the simulator's dynamics are over world models. Share of the gain: (SR - SR of Only-RGB) / (SR with the simulator's dynamics - SR "
+        "differences between trainings; those of the differences from the simulator's dynamics are over world models. "
+        "Share of the gain: (SR - SR of Only-RGB) / (SR with the simulator's dynamics - SR "
         "of Only-RGB). Policies of rows with 15 copies are also trained on the states of 15 augmented copies of every "
         "demonstration. Measures are means over the world models that have been probed. Derived "
         "columns have the verdict of `add_dynamics.py`, before any training, with the checks that failed. Written by "
@@ -68,8 +69,7 @@ def write_source_page(results: Path, tasks: list[str], architecture: str = "glim
     parts += [
         "## Commands",
         f"`python recipes/paper/sources.py{form} --tasks TASK --only SOURCE` also derives the dataset of a source. "
-        f"Runs by commit: "
-        f"{commits}.",
+        f"Runs by commit: {commits}.",
         "\n".join(["```bash", *commands, "```"]),
     ]
     written.append(results / "README.md")

@@ -85,9 +85,8 @@ def fit(
     own = generator if ranks() == 1 else torch.Generator(device)
     loss_module = make_loss(own)
     start, first, path = 0, None, folder / "checkpoint" / "world_model.pt"
-    form = plain_settings(replace(settings, updates=1)) | {
-        "seed": seed
-    }  # a training may go on for more updates
+    # A training may go on for more updates.
+    form = plain_settings(replace(settings, updates=1)) | {"seed": seed}
     if state := load_training_state(path):
         if state.get("form", form) != form or state["update"] > settings.updates:
             raise ValueError(f"{folder} holds a training with other settings; choose another folder")

@@ -81,11 +81,12 @@ class WorldModelTraining(WorldModelArchitecture):
             raise ValueError(
                 f"{type(self).__name__}.labelled must be above 0, got 0; supervision none uses no dynamics"
             )
-        idle = {"labelled", "beta_dynamics"} if self.supervision == "none" else set()
-        idle |= set() if self.beta_rgb else {"rarity"}
-        for name in sorted(idle):
-            if getattr(self, name) != getattr(type(self), name):
-                why = "supervision none" if name in ("labelled", "beta_dynamics") else "beta_rgb 0"
+        for name, idle, why in (
+            ("labelled", self.supervision == "none", "supervision none"),
+            ("beta_dynamics", self.supervision == "none", "supervision none"),
+            ("rarity", not self.beta_rgb, "beta_rgb 0"),
+        ):
+            if idle and getattr(self, name) != getattr(type(self), name):
                 raise ValueError(f"{type(self).__name__}.{name} has no effect with {why}; leave it out")
         if not self.beta_rgb and self.supervision == "none":
             raise ValueError(
