@@ -146,10 +146,10 @@ def test_real_cells(recordings, tmp_path):
 @pytest.mark.slow
 def test_ray_runs_the_same_cells(ray, recordings, tmp_path):
     commands.place_recordings(tmp_path, recordings, *TASKS[:2])
-    (tmp_path / "runs/tables" / NAMES[2]).mkdir(parents=True)
-    (tmp_path / "runs/tables" / NAMES[2] / "config.json").write_text(
-        "{}"
-    )  # of another release: the cell fails
+    other = tmp_path / "runs/tables" / NAMES[2]
+    other.mkdir(parents=True)
+    for name in ("config.json", "metrics.jsonl"):  # a run of another release: the cell fails
+        (other / name).write_text("{}")
     (tmp_path / "datasets/bin_dropping").symlink_to(recordings(TASKS[2]), target_is_directory=True)
     command = [
         sys.executable,
