@@ -112,7 +112,7 @@ def train(config: Config, dataset: str | Path, folder: Path, seed: int, device: 
     output, root = folder.absolute() / "lerobot", find_dataset(dataset).absolute()
     settings = output / TRAINED / "train_config.json"
     if settings.exists():
-        arguments = [f"--config_path={settings}", "--resume=true"]
+        arguments = [f"--config_path={settings}", "--resume=true", f"--policy.device={device}"]
     else:
         shutil.rmtree(output, ignore_errors=True)  # of a run without a checkpoint
         arguments = [

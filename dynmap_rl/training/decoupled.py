@@ -28,6 +28,7 @@ from dynmap_rl.modules.checkpoints import (
     save_world_model,
 )
 from dynmap_rl.modules.world_model import WorldModel
+from dynmap_rl.runs.folder import plain_settings
 from dynmap_rl.utils.devices import Compute, choose_device, seed_everything
 from dynmap_rl.utils.files import check_space, read_json, write_json
 from dynmap_rl.utils.processes import run_processes
@@ -38,7 +39,9 @@ from .dataset import choose_augmentation
 from .policy import train_policy
 from .settings import PolicyTraining
 
-TRAINED = "trained.json"  # written after a policy's training, with the world model's fingerprint
+TRAINED = (
+    "trained.json"  # written after a policy's training, with the world model's fingerprint and the settings
+)
 Judge = Callable[[WorldModel, nn.Module], dict]
 
 
@@ -91,13 +94,17 @@ def train_policies(
         The fingerprint of the frozen world model.
 
     Raises:
-        ValueError: the frozen weights have changed, corrections are wanted and there is no expert, or copies and there is
-            no task in the plane.
+        ValueError: the frozen weights have changed, ``folder`` has policies with other settings, corrections are wanted
+            and there is no expert, or copies and there is no task in the plane.
         OSError: a process died, or the disk is full.
     """
     settings, compute, folder = settings or PolicyTraining(), compute or Compute(), Path(folder)
     check_corrections(settings, task)
     check_copies(settings, task)
+    wanted = plain_settings(settings)
+    for path in (folder / f"seed_{seed}" / TRAINED for seed in seeds):
+        if path.exists() and read_json(path).get("settings", wanted) != wanted:
+            raise ValueError(f"{path.parent} holds a policy with other settings; choose another folder")
     world_model.eval().requires_grad_(False)
     frozen = fingerprint(world_model)
     save_world_model(folder / "world_model", world_model)
@@ -148,7 +155,7 @@ def _train(arguments: tuple[_Work, int]) -> None:
     """Train the policy of a seed, unless it is trained already."""
     work, seed = arguments
     path = work.folder / f"seed_{seed}"
-    if (path / TRAINED).exists() and read_json(path / TRAINED) == {"world_model_sha256": work.frozen}:
+    if (path / TRAINED).exists() and read_json(path / TRAINED)["world_model_sha256"] == work.frozen:
         return
     torch.set_num_threads(1)
     seed_everything(1000 + seed)
@@ -164,7 +171,8 @@ def _train(arguments: tuple[_Work, int]) -> None:
         more = replace(work.settings, updates=work.settings.correction_updates)
         train_policy(policy, *states, path, more, seed=seed, done=work.settings.updates, logger=work.logger)
     save_policy(path / "policy", policy, world_model)
-    write_json(path / TRAINED, {"world_model_sha256": work.frozen})
+    trained = {"world_model_sha256": work.frozen, "settings": plain_settings(work.settings)}
+    write_json(path / TRAINED, trained)
 
 
 def _evaluate(arguments: tuple[_Work, int]) -> None:

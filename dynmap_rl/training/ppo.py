@@ -68,7 +68,8 @@ def train_ppo(
         logger: ``tensorboard``, ``wandb``, ``trackio`` or None.
 
     Raises:
-        ValueError: the loss is not finite, or the training state is of an earlier release; the state is kept.
+        ValueError: the loss is not finite, or the training state is of an earlier release or of more iterations; the
+            state is kept.
         OSError: a process died.
     """
     folder = Path(folder)
@@ -103,6 +104,10 @@ def train_ppo(
         networks.load_state_dict(state["networks"])
         optimizer.load_state_dict(state["optimizer"])
         start, seconds = state["iteration"], state["seconds"]
+        if start > settings.iterations:
+            raise ValueError(
+                f"PPOTraining.iterations must be at least the {start} of {state_path}, got {settings.iterations}"
+            )
     truncate_metrics(folder, start)
 
     frames = settings.num_envs * settings.steps

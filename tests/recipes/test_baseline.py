@@ -42,7 +42,7 @@ def test_a_stopped_run_goes_on_at_its_last_checkpoint(train, tmp_path):
     settings = tmp_path / "lerobot" / baseline.TRAINED / "train_config.json"
     settings.parent.mkdir(parents=True)
     settings.touch()
-    assert train() == [f"--config_path={settings}", "--resume=true"]
+    assert train() == [f"--config_path={settings}", "--resume=true", "--policy.device=cpu"]
 
 
 def test_a_failed_training_ends_with_the_last_line_of_its_log(train):

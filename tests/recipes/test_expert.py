@@ -41,6 +41,10 @@ def test_more_iterations_resume_the_run(finished, tmp_path):
     run_small(folder, "expert", "--run", "run", "--ppo.iterations", "3")
     assert list_checkpoints(folder / "run/checkpoint")[-1] == "iteration_003"
     assert read_json(folder / "run/config.json")["ppo"]["iterations"] == 2, "those it began with"
+    result = run(
+        folder, "expert", "--config_path", PRESETS / "expert.yaml", "--run", "run", "--ppo.iterations", "1"
+    )
+    assert result.returncode == 2 and "--ppo.iterations must be at least the 3" in result.stderr
 
 
 @pytest.mark.parametrize("arguments", [["--task", "nope"], ["--threads", "0"], ["--ppo.epochs", "0"]])

@@ -75,6 +75,8 @@ def test_a_finished_seed_is_left_alone(tmp_path, monkeypatch):
     train(tmp_path)
     monkeypatch.setattr(decoupled, "compute_features", stop)
     train(tmp_path, judge=stop)
+    with pytest.raises(ValueError, match="other settings"):
+        train(tmp_path, settings=replace(POLICY, kind="feedforward"))
 
 
 def test_a_policy_sees_the_states_of_augmented_copies(tmp_path, monkeypatch):
