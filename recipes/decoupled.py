@@ -80,6 +80,7 @@ def main(config: Config) -> None:
     check_copies(config.policy, config.task)
     if config.dataset:
         check_dataset(config.dataset, config.task)
+    augmentation = choose_augmentation(task, config.world_model.augmentation)
     world_model = load_pretrained(config) if config.pretrained else None
     if world_model is None:
         check_windows(config.world_model, task.layout.steps, "world_model")
@@ -94,7 +95,6 @@ def main(config: Config) -> None:
         print(f"{folder} is complete; delete it to run again\n\n{row_text(result, paper_numbers(result))}")
         return
 
-    augmentation = choose_augmentation(task, config.world_model.augmentation)
     config = replace(config, world_model=replace(config.world_model, augmentation=augmentation))
     torch.set_num_threads(config.compute.threads)
     with first_rank_first():

@@ -70,6 +70,7 @@ def main(config: Config) -> None:
     join_ranks(config.compute.device)
     task, seeds = get_task(config.task), parse_seeds(config.seeds)
     choose_device(config.compute.device)
+    augmentation = choose_augmentation(task, config.training.augmentation, imitated=True)
     check_windows(config.training, task.layout.steps, "training")
     check_logger(config.logger)
     if config.dataset:
@@ -84,7 +85,6 @@ def main(config: Config) -> None:
 
     with first_rank_first():
         dataset = find_or_record(config.task, config.dataset, folder)
-    augmentation = choose_augmentation(task, config.training.augmentation, imitated=True)
     training = replace(config.training, augmentation=augmentation)
     config = replace(config, training=training)
     load = partial(load_demonstrations, dataset, config.cache)

@@ -9,13 +9,13 @@ from dynmap_rl.utils.settings import check_at_least
 
 @dataclass(frozen=True)
 class Augmentation:
-    """Random changes of training windows (see :func:`dynmap_rl.data.augment`)."""
+    """Random changes of training windows (see :func:`dynmap_rl.data.augment`); recipes change tasks in the plane alone."""
 
     # Permute the colour channels of each window.
     recolor: bool = True
-    # Mirror half of the windows left to right.
+    # Mirror half of the windows left to right (joint and end to end: where the task is symmetric).
     mirror: bool = True
-    # Largest shift of a window, in pixels.
+    # Largest shift of a window, in pixels (joint and end to end: where the task is symmetric).
     max_shift: int = 6
 
     def __post_init__(self):

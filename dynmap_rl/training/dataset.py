@@ -62,7 +62,12 @@ def choose_augmentation(task: BaseTask, augmentation: Augmentation, imitated: bo
     """Return the augmentation for windows of a task: none where frames are no flat pictures of the plane.
 
     Where a policy learns from the windows too (``imitated``), they are mirrored and shifted in symmetric tasks only.
+
+    Raises:
+        ValueError: settings other than the default, and the task is not in the plane.
     """
+    if not task.planar and augmentation not in (Augmentation(), Augmentation.off()):
+        raise ValueError(f"augmentation has no effect with {task.name}; leave its options out")
     if imitated and not task.symmetric:
         augmentation = replace(augmentation, mirror=False, max_shift=0)
     return augmentation if task.planar else Augmentation.off()
