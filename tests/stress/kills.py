@@ -32,6 +32,7 @@ from dynmap_rl.utils.version import find_commit
 TESTS = Path(__file__).parents[1]
 RECIPES, PRESETS = TESTS.parent / "recipes", TESTS / "presets"
 RUN = "balance_reaching_obstacle_joint_none_recurrent"  # with the run whose world model it needs
+TASKS, SMALL = ("balance_reaching", "balance_reaching_obstacle"), "--episodes 20 --eval_episodes 4"
 COMMANDS = {
     "collect": "--episodes 60 --eval_episodes 10",
     "expert": f"--config_path {PRESETS}/expert.yaml --ppo.iterations 12 --ppo.checkpoint_every 2",
@@ -111,16 +112,24 @@ def plain(value):
     return [plain(item) for item in value] if isinstance(value, list) else value
 
 
+def prepare(recipe: str, folder: Path) -> Path:
+    """Make a folder for a recipe; that of tables gets small recordings, which it would otherwise make whole."""
+    folder.mkdir()
+    for task in TASKS if recipe == "paper/tables" else ():
+        command = [sys.executable, str(RECIPES / "collect.py"), "--task", task, *SMALL.split()]
+        subprocess.run(command, cwd=folder, check=True, capture_output=True)
+    return folder
+
+
 def torment(recipe: str, kills: int, folder: Path) -> dict[str, int | str]:
-    whole = folder / f"{recipe.replace('/', '_')}_whole"
-    whole.mkdir()
+    name = recipe.replace("/", "_")
+    whole = prepare(recipe, folder / f"{name}_whole")
     began = time.perf_counter()
     run(recipe, whole)
     duration = time.perf_counter() - began
     expected, ends, count, midway, runs = contents(whole), finished(whole), 0, 0, 0
     while count < kills:
-        killed, runs = folder / f"{recipe.replace('/', '_')}_killed_{runs}", runs + 1
-        killed.mkdir()
+        killed, runs = prepare(recipe, folder / f"{name}_killed_{runs}"), runs + 1
         kept, ended = {}, False
         while not ended:
             ended = run(recipe, killed, random.uniform(0, duration / 2) if count < kills else None)
