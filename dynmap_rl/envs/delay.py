@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from copy import deepcopy
 from dataclasses import dataclass
 from numbers import Integral
 from typing import Any
@@ -60,6 +61,12 @@ class FrameDelay:
         return None if lost else delay
 
 
+def check_delay(delay: FrameDelay) -> None:
+    """Raise ``ValueError`` for what is no delay, such as a number."""
+    if not isinstance(delay, FrameDelay):
+        raise ValueError(f"delay must be a FrameDelay, such as FrameDelay(steps=6), got {delay!r}")
+
+
 class DelayFrames(gym.Wrapper, gym.utils.RecordConstructorArgs):
     """Wrapper that delays, jitters and drops the frames of a Gymnasium environment.
 
@@ -79,8 +86,7 @@ class DelayFrames(gym.Wrapper, gym.utils.RecordConstructorArgs):
     def __init__(self, env: gym.Env, delay: FrameDelay, key: str = "pixels"):
         gym.utils.RecordConstructorArgs.__init__(self, delay=delay, key=key)
         gym.Wrapper.__init__(self, env)
-        if not isinstance(delay, FrameDelay):
-            raise ValueError(f"delay must be a FrameDelay, such as FrameDelay(steps=6), got {delay!r}")
+        check_delay(delay)
         space = env.observation_space
         if isinstance(space, gym.spaces.Dict) and key not in space.spaces:
             raise ValueError(f"key must be one of {', '.join(space.spaces)}, got {key!r}")
@@ -92,10 +98,9 @@ class DelayFrames(gym.Wrapper, gym.utils.RecordConstructorArgs):
             self._generator = make_generator(seed)
         observation, info = self.env.reset(seed=seed, options=options)
         self._step, self._taken = 0, -1
-        self._due: dict[int, list[int]] = defaultdict(
-            list
-        )  # steps at which frames were taken, by that of arrival
-        self._frames: dict[int, np.ndarray] = {}
+        # Steps at which frames were taken, by that of arrival. A frame may be a dict, of several cameras.
+        self._due: dict[int, list[int]] = defaultdict(list)
+        self._frames: dict[int, Any] = {}
         return self._deliver(observation, info, delay=0)
 
     def step(self, action):
@@ -109,16 +114,16 @@ class DelayFrames(gym.Wrapper, gym.utils.RecordConstructorArgs):
         if delay is not None:
             self._due[self._step + delay].append(self._step)
             frame = observation if self.key is None else observation[self.key]
-            self._frames[self._step] = frame.copy()  # an environment may use its buffer again
+            self._frames[self._step] = deepcopy(frame)  # an environment may use its buffer again
         arrived = {taken: self._frames.pop(taken) for taken in sorted(self._due.pop(self._step, ()))}
         if arrived and max(arrived) > self._taken:
             self._taken = max(arrived)
-            self._newest = arrived[self._taken].copy()  # a caller may change what it gets
+            self._newest = deepcopy(arrived[self._taken])  # a caller may change what it gets
         info |= {
             "delay": np.int64(self._report(self._taken)),
             "arrived": {self._report(taken): frame for taken, frame in arrived.items()},
         }
-        newest = self._newest.copy()
+        newest = deepcopy(self._newest)
         return newest if self.key is None else observation | {self.key: newest}, info
 
     def _report(self, taken: int) -> int:

@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import Transform
 
-from .delay import FrameDelay, make_generator
+from .delay import FrameDelay, check_delay, make_generator
 
 NEVER = -1
 
@@ -32,6 +32,9 @@ class DelayTransform(Transform):
         bursts: deliver every frame that arrives, rather than the newest.
         pixels: key of the frames, which is read and written.
         delay_key: key of the delays, which is written.
+
+    Raises:
+        ValueError: ``delay`` is no :class:`FrameDelay`, or ``seed`` has another number of seeds than there are worlds.
     """
 
     def __init__(
@@ -43,6 +46,7 @@ class DelayTransform(Transform):
         delay_key: NestedKey = "delay",
     ):
         super().__init__(in_keys=[pixels], out_keys=[pixels, delay_key])
+        check_delay(delay)
         self.delay, self.seed, self.bursts = delay, seed, bursts
         self.places = 2 * delay.jitter + 1 if bursts else 1
         self._frames = None
@@ -63,6 +67,12 @@ class DelayTransform(Transform):
             raise ValueError(
                 f"seed must have one seed for each of {count} worlds, got {len(self._generators)}"
             )
+
+    def clone(self) -> DelayTransform:
+        """Return a transform with the same settings and no frames."""
+        other = super().clone()
+        other._frames = None
+        return other
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         pixels = self._frames_of(tensordict_reset)

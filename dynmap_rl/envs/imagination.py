@@ -64,10 +64,10 @@ class ImaginationEnv(ModelBasedEnvBase):
         size = world_model.latent_size
         if start.ndim != 1 or start.get("latent", torch.empty(0)).shape != (*start.shape, size):
             raise ValueError(f"start must be a TensorDict [B] with latent [B, {size}], got {start}")
-        device = start["latent"].device
+        device = next(world_model.parameters()).device  # to which the world model would be moved
         super().__init__(world_model, device=device, batch_size=start.batch_size)
         self.decode_pixels, self.reward_function = decode_pixels, reward
-        start = start.exclude(*OTHERS)
+        start = start.exclude(*OTHERS).to(device)
         keys = [key for key in start.keys(True, True) if key not in STEP_KEYS]
         self.constant = [key for key in keys if key[0] not in ("predicted_dynamics", "reconstruction")]
         with torch.no_grad():
@@ -76,6 +76,7 @@ class ImaginationEnv(ModelBasedEnvBase):
 
     def _complete(self, start: TensorDictBase) -> TensorDict:
         """Return all observations at a start."""
+        start = start.clone()  # the caller may write to its tensors
         td = TensorDict({}, self.batch_size, device=self.device).update(start.select(*self.constant))
         latent = start["latent"]
         values = (torch.zeros_like(latent), *self.world_model.initial_state(len(latent), latent.device))

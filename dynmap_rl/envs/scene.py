@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
-from numbers import Real
+from numbers import Integral, Real
 from typing import ClassVar
 
 import numpy as np
@@ -28,7 +28,7 @@ class Scene:
 
     Raises:
         ValueError: a number is not finite, a size or the density not positive, the friction negative, a place not in the
-            picture, or the block's centre beside the cart.
+            picture, a colour not three whole numbers of 0..255, or the block's centre beside the cart.
     """
 
     cart_width: float = 0.25
@@ -49,6 +49,7 @@ class Scene:
     def __post_init__(self):
         for name, value in vars(self).items():
             if name.endswith("_color"):
+                _check_color(name, value)
                 continue
             if not isinstance(value, Real) or not math.isfinite(value):
                 raise ValueError(f"{name} of the scene must be a finite number, got {value!r}")
@@ -91,6 +92,12 @@ class Scene:
         return replace(self, **{k: tuple(v) if k.endswith("color") else v for k, v in values.items()})
 
 
+def _check_color(name: str, value: Color) -> None:
+    whole = isinstance(value, Sequence) and all(isinstance(channel, Integral) for channel in value)
+    if not whole or len(value) != 3 or not all(0 <= channel <= 255 for channel in value):
+        raise ValueError(f"{name} of the scene must be three whole numbers of 0..255, got {value!r}")
+
+
 @dataclass(frozen=True)
 class ObstacleScene(Scene):
     """Scene of task 2: a vertical obstacle, given by its middle and its length."""
@@ -119,6 +126,9 @@ class SceneRanges:
 
     Attributes:
         scene: class of the scenes that are drawn. A subclass with more factors has a range for each.
+
+    Raises:
+        ValueError: a range is not two finite numbers, the lower one first.
     """
 
     cart_width: Range = (0.20, 0.30)
@@ -138,6 +148,15 @@ class SceneRanges:
     min_contrast: float = 60.0
 
     scene: ClassVar[type[Scene]] = Scene
+
+    def __post_init__(self):
+        for name, value in vars(self).items():
+            if name.startswith("min_"):
+                continue
+            if np.shape(value) != (2,) or not np.isfinite(value).all() or value[0] > value[1]:
+                raise ValueError(
+                    f"{name} of the ranges must be two finite numbers, the lower one first, got {value!r}"
+                )
 
 
 @dataclass(frozen=True)

@@ -62,11 +62,19 @@ def roll_out(
         one-step prediction of the actor's world model at t, zero at t = 0, for each quantity that it decodes.
 
     Raises:
-        ValueError: the actor is of other sizes than the task, or the task knows no pushes.
+        ValueError: the actor is of other sizes than the task, or too short a memory for the delay, or the task knows no
+            pushes.
     """
     module = actor if isinstance(actor, nn.Module) else nn.Module()
     seeds, rules, device = [int(seed) for seed in seeds], get_task(task), find_device(actor)
     check_actor(actor, rules)
+    if delay and isinstance(actor, DelayedActor):
+        youngest = delay.steps - delay.jitter + delay.error
+        if youngest > actor.max_delay:
+            raise ValueError(
+                f"max_delay of the actor must be at least {youngest} steps, the age of the youngest frames, got "
+                f"{actor.max_delay}"
+            )
     if pushed and not isinstance(rules, Task):
         raise ValueError(f"pushed needs a task of cart and block, got {task}")
     pushes = rules.pushes if pushed else 0
@@ -140,8 +148,8 @@ def _roll_out(
     pixels = "present" if delay else "pixels"
     keys = ["action", "goal", *EVENTS, *([pixels] if keep_pixels else [])]
     td = env.reset(scene_seed=torch.tensor(seeds))
-    world_model = getattr(actor, "world_model", None)
-    sizes = world_model.sizes if world_model else {}
+    own = actor.actor if isinstance(actor, DelayedActor) else actor
+    sizes = own.world_model.sizes if isinstance(own, Actor) else {}
     predicted = {quantity: torch.zeros(count, size, device=device) for quantity, size in sizes.items()}
     pushed, steps = any(plan.pushes for plan in plans), []
     bar = {} if title else {"disable": True}  # False would override TQDM_DISABLE
@@ -158,7 +166,8 @@ def _roll_out(
         steps.append(step.set("predicted_dynamics", TensorDict(predicted, [count])))
         td = step_mdp(td, keep_other=False)
         if sizes:
-            predicted = world_model.decode_dynamics(td["predicted_latent"], td["hidden1"], td["hidden2"])
+            states = td[own.predicted_latent], td[own.memory[0]], td[own.memory[2]]
+            predicted = own.world_model.decode_dynamics(*states)
     episodes = torch.stack(steps, 1).cpu()
     return episodes.rename_key_(pixels, "pixels") if keep_pixels else episodes
 

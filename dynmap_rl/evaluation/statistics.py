@@ -181,7 +181,7 @@ def outcome_gap(terms: Sequence[tuple[int, list[list[dict]]]], outcome: str = "s
         raise ValueError(
             "results must be on the same start states, got different scenes; evaluate them again"
         )
-    flags = isinstance(terms[0][1][0][0][outcome], bool)
+    flags = isinstance(terms[0][1][0][0][outcome], bool | np.bool_)
     # Sums of flags are whole numbers, so that a tie is one.
     unit = math.lcm(*(len(policies) for _, policies in terms))
     sums = sum(

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Iterable
-
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from tensordict.utils import NestedKey, unravel_key
-from torchrl.data import Composite, Unbounded
 from torchrl.envs import TensorDictPrimer
-from torchrl.modules import recurrent_mode
 
+from .memory import check_frame, make_primer, recall, remember, warn_without_memory
 from .policy import FeedforwardPolicy, RecurrentPolicy
 from .world_model import WorldModel
 
@@ -117,20 +113,28 @@ class LatentActor(TensorDictModuleBase):
         return self.act(tensordict, *(tensordict[key] for key in self.states))
 
     def act(self, tensordict: TensorDictBase, latent, hidden1, hidden2) -> TensorDictBase:
-        """Act on states ``[..., Z]`` and ``[..., H]`` that are not in the TensorDict."""
-        state = None
-        if self.policy_memory:
-            sizes = dict.fromkeys(self.policy_memory, self.policy.lstm.hidden_size)
-            state = _recall(tensordict, sizes, self.is_init, latent.device)
+        """Act on states ``[..., Z]`` and ``[..., H]`` that are not in the TensorDict.
+
+        Raises:
+            TypeError: the policy has a memory and is no :class:`RecurrentPolicy`.
+        """
+        state, keys = None, self.policy_memory
+        if keys:
+            sizes = dict.fromkeys(keys, self.policy.lstm.hidden_size)
+            state = recall(tensordict, sizes, self.is_init, latent.device)
         action, state = self.policy.step(latent, hidden1, hidden2, tensordict[self.goal], state)
+        if state and not keys:
+            raise TypeError(
+                f"a policy with memory must be a RecurrentPolicy, got {type(self.policy).__name__}"
+            )
         tensordict.set(self.action, action)
-        remember(tensordict, self.policy_memory, state or ())
+        remember(tensordict, keys, state or ())
         return tensordict
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Make the transform that gives an environment the policy's memory, zero at every reset."""
         size = self.policy.lstm.hidden_size if self.policy_memory else 0
-        return _make_primer(dict.fromkeys(self.policy_memory, size))
+        return make_primer(dict.fromkeys(self.policy_memory, size))
 
 
 class Actor(TensorDictModuleBase):
@@ -204,7 +208,9 @@ class Actor(TensorDictModuleBase):
         """
         pixels = tensordict.get(self.pixels, None)
         if pixels is None:
-            return tensordict.set(self.latent, tensordict[self.predicted_latent])
+            predicted = tensordict.get(self.predicted_latent, None)
+            check_frame(self, predicted is not None)
+            return tensordict.set(self.latent, predicted)
         return tensordict.set(self.latent, self.world_model.encode(pixels, self.mixed))
 
     def act(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -221,66 +227,11 @@ class Actor(TensorDictModuleBase):
 
     def _recall(self, tensordict: TensorDictBase) -> tuple[torch.Tensor, ...]:
         sizes = dict.fromkeys(self.memory, self.world_model.hidden_size)
-        return _recall(tensordict, sizes, self.is_init, tensordict[self.latent].device)
+        return recall(tensordict, sizes, self.is_init, tensordict[self.latent].device)
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Make the transform that gives an environment the memories, zero at every reset."""
         sizes = dict.fromkeys(self.memory, self.world_model.hidden_size)
         if self.latent_actor.policy_memory:
             sizes |= dict.fromkeys(self.latent_actor.policy_memory, self.policy.lstm.hidden_size)
-        return _make_primer(sizes)
-
-
-def _recall(tensordict: TensorDictBase, sizes: dict, is_init: NestedKey, device) -> tuple[torch.Tensor, ...]:
-    """Return the entries of ``sizes``; zeros where an episode begins, and where they and ``is_init`` are absent."""
-    batch, begins = tensordict.batch_size, tensordict.get(is_init, None)
-    check_memory(tensordict, sizes, begins)
-    state = tuple(tensordict.get(k, torch.zeros(*batch, n, device=device)) for k, n in sizes.items())
-    return state if begins is None else tuple(s.masked_fill(begins, 0.0) for s in state)
-
-
-def check_memory(tensordict: TensorDictBase, keys: Iterable[NestedKey], begins: torch.Tensor | None) -> None:
-    """Check that memory is there, except where episodes begin, and that the call is of one time step.
-
-    Raises:
-        KeyError: the environment does not pass the memory on.
-        RuntimeError: TorchRL's recurrent mode is on, in which modules read whole windows.
-    """
-    if recurrent_mode():
-        raise RuntimeError(
-            "an actor reads one time step; windows are for make_world_model_module and make_policy_module"
-        )
-    missing = [key for key in keys if tensordict.get(key, None) is None]
-    if missing and begins is not None and not begins.all():
-        raise KeyError(
-            f"{missing[0]} is missing after the first step; append actor.make_tensordict_primer() to the environment"
-        )
-
-
-def warn_without_memory(
-    actor: LatentActor | Actor, tensordict: TensorDictBase, keys: Iterable[NestedKey]
-) -> None:
-    """Warn if neither memory nor the start of episodes is there in two calls in a row, as in an environment without both."""
-    blind = (
-        any(tensordict.get(key, None) is None for key in keys) and tensordict.get(actor.is_init, None) is None
-    )
-    if blind and actor.blind:
-        warnings.warn(
-            "the actor had no memory in two calls in a row; append InitTracker() and actor.make_tensordict_primer() to the "
-            "environment, or pass on what is written under next",
-            stacklevel=3,
-        )
-    actor.blind = blind
-
-
-def remember(tensordict: TensorDictBase, keys, values) -> None:
-    """Write values under ``next``."""
-    for key, value in zip(keys, values, strict=True):
-        tensordict.set(unravel_key(("next", key)), value)
-
-
-def _make_primer(sizes: dict) -> TensorDictPrimer:
-    specs = Composite()
-    for key, size in sizes.items():
-        specs[key] = Unbounded((size,))
-    return TensorDictPrimer(specs, default_value=0.0, expand_specs=True)
+        return make_primer(sizes)

@@ -38,7 +38,14 @@ def make_world_model(
         architecture: see :class:`dynmap_rl.modules.WorldModel`, as for the following arguments.
         image_size: side of the frames of a camera.
         cameras: number of cameras.
+
+    Raises:
+        ValueError: a quantity has no constants.
     """
+    if isinstance(supervision, str) or not set(supervision) <= set(constants):
+        raise ValueError(
+            f"supervision must be a sequence of {', '.join(constants.keys() - {'action', 'goal'})}, got {supervision!r}"
+        )
     dynamics = {q: Normalizer(**constants[q]) for q in supervision}
     sizes = latent_size, hidden_size, architecture, image_size, cameras
     return WorldModel(Normalizer(**constants["action"]), dynamics, *sizes)

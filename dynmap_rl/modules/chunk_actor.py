@@ -23,10 +23,13 @@ class ChunkActor:
         delay: steps from a frame to the first action of its chunk that can still be executed.
 
     Raises:
+        TypeError: ``actor`` is no :class:`Actor`.
         ValueError: ``delay`` is negative or not below ``size``.
     """
 
     def __init__(self, actor: Actor, size: int, delay: int = 0):
+        if not isinstance(actor, Actor):
+            raise TypeError(f"actor must be an Actor, got {type(actor).__name__}")
         if not 0 <= delay < size:
             raise ValueError(f"delay must be between 0 and size - 1, got {delay} and a size of {size}")
         self.actor, self.size, self.delay = actor, size, delay

@@ -11,7 +11,8 @@ from tensordict.utils import NestedKey, unravel_key
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import TensorDictPrimer
 
-from .actor import MEMORY, Actor, check_memory, remember
+from .actor import MEMORY, Actor
+from .memory import check_frame, check_memory, remember, warn_without_memory
 from .world_model import WorldModel
 
 BASE = ("predicted_latent", *MEMORY)  # state of the world model before the oldest step that is remembered
@@ -31,9 +32,9 @@ class DelayedActor(TensorDictModuleBase):
     ``[..., 1]``: the number of steps since the frame in ``pixels`` was taken. Several frames that arrive in the same
     step have one more axis, ``pixels`` ``[..., M, 3, S, cameras * S]`` and ``delay`` ``[..., M]``, in any order. A negative delay
     marks a place without a frame, and frames from before the episode are not used. Of several frames of one step, the last
-    is used.
-    :class:`dynmap_rl.envs.DelayTransform` writes both entries. Without ``delay`` in the TensorDict, every frame is as old
-    as the argument ``delay``, or the first one of the episode. Without ``pixels``, no frame has arrived.
+    is used. :class:`dynmap_rl.envs.DelayTransform` writes both entries. Without ``delay`` in the TensorDict, every frame is as old
+    as the argument ``delay``, or the first one of the episode. Without ``pixels``, no frame has arrived, which the first
+    step of an episode does not allow.
 
     A call is :meth:`observe`, :meth:`act` and :meth:`predict`, as that of :class:`Actor`. In ``env.rollout`` or a
     collector, append :meth:`make_tensordict_primer` and ``InitTracker`` to the environment.
@@ -49,6 +50,7 @@ class DelayedActor(TensorDictModuleBase):
     Raises:
         ValueError: ``delay`` is negative, above ``max_delay`` or not whole; or, in a call, there is not one delay for
             each frame.
+        KeyError: an episode begins without a frame.
     """
 
     def __init__(
@@ -66,6 +68,7 @@ class DelayedActor(TensorDictModuleBase):
         if not 0 <= delay <= max_delay:
             raise ValueError(f"delay must be between 0 and max_delay, got {delay} and {max_delay}")
         self.actor, self.delay, self.max_delay = actor, delay, max_delay
+        self.is_init, self.blind = actor.is_init, False
         self.delay_key, self.history = unravel_key(delay_key), unravel_key(history)
         memory = [unravel_key(key) for key in actor.memory]
         entries = [unravel_key((history, name)) for name in self._sizes()]
@@ -92,6 +95,7 @@ class DelayedActor(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Observe, act and predict."""
+        warn_without_memory(self, tensordict, [self.history])
         return self.predict(self.act(self.observe(tensordict)))
 
     def observe(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -142,10 +146,10 @@ class DelayedActor(TensorDictModuleBase):
 
     def _receive(self, tensordict: TensorDictBase, history: TensorDict) -> None:
         """Encode the frames that arrive and put each where it belongs."""
-        pixels = tensordict.get(self.actor.pixels, None)
+        pixels, step = tensordict.get(self.actor.pixels, None), history["step"]
         if pixels is None:
+            check_frame(self.actor, bool(step.any()))
             return
-        step = history["step"]
         delay = tensordict.get(self.delay_key, step.clamp(max=self.delay))
         if pixels.ndim == tensordict.ndim + 3:
             pixels = pixels.unsqueeze(-4)  # (..., M, 3, 64, 64) with M = 1

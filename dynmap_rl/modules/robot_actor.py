@@ -41,10 +41,13 @@ class RobotActor:
             block are changes, which end.
 
     Raises:
+        TypeError: ``actor`` is no :class:`DelayedActor`.
         ValueError: ``period`` is not positive, or ``max_delay`` is 0, so that no late frame would be used.
     """
 
     def __init__(self, actor: DelayedActor, period: float = 0.05, hold: bool = False):
+        if not isinstance(actor, DelayedActor):
+            raise TypeError(f"actor must be a DelayedActor, got {type(actor).__name__}")
         if actor.max_delay < 1:
             raise ValueError(
                 "actor must have a max_delay of at least 1 step; give DelayedActor max_delay=..."
@@ -72,7 +75,7 @@ class RobotActor:
         if goal.shape != (size,) or not goal.isfinite().all():
             raise ValueError(f"goal must be {size} finite numbers, got {goal.tolist()}")
         self.goal, self.unused = goal, 0
-        self.since, self.memory = since, TensorDict({}, device=self.device)
+        self.since, self.memory, self.actor.blind = since, TensorDict({}, device=self.device), False
         self.frames: list[tuple[float, np.ndarray]] = []
         self.times: deque[float] = deque(maxlen=self.actor.max_delay + 1)  # of the last steps
 

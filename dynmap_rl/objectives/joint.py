@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import dispatch
 from tensordict.utils import NestedKey, unravel_key
@@ -107,7 +106,7 @@ class JointLoss(LossModule):
         keys, masks = self.tensor_keys, self.world_model_loss._loss_mask_keys()
         target, ignore = find_target(tensordict, keys.action, keys.expert_action, keys.disturbed, masks)
         # Divided by the same number in all processes, so that the mean of their losses is the loss of the whole batch.
-        total = mean_over_ranks if torch.is_grad_enabled() else (lambda weight: weight)
+        total = mean_over_ranks if self.world_model_loss.sums_over_ranks() else (lambda weight: weight)
         within = begins_within(tensordict, keys.step_count)
         loss = imitation_loss(predicted, target, self.policy.action, ignore, self.emphasis, total, within)
         return TensorDict({**losses, "loss_policy": self.beta_joint * loss}, [])

@@ -47,6 +47,9 @@ class WorldModelLoss(LossModule):
         beta_rgb: weight of ``loss_rgb``; with 0, no frames are decoded and this loss is missing.
         rgb_frames: number of random frames of the batch that are decoded; None decodes all.
         generator: generator that draws these frames and steps; by default torch's own.
+        distributed: the processes of ``torch.distributed`` share a batch, and all of them compute the loss of their
+            part in step. The mean of their losses is then that of the whole batch, also where parts have different
+            numbers of known steps.
 
     Raises:
         TypeError: ``world_model`` is none.
@@ -74,6 +77,7 @@ class WorldModelLoss(LossModule):
         beta_rgb: float = 1.0,
         rgb_frames: int | None = None,
         generator: torch.Generator | None = None,
+        distributed: bool = False,
     ):
         super().__init__()
         if not isinstance(world_model, WorldModel):
@@ -82,6 +86,7 @@ class WorldModelLoss(LossModule):
         self.beta_z, self.beta_dynamics = beta_z, beta_dynamics
         self.stop_gradient, self.rarity = stop_gradient, rarity
         self.imagined, self.beta_rgb, self.rgb_frames = imagined, beta_rgb, rgb_frames
+        self.distributed = distributed
 
     @property
     def in_keys(self) -> list[NestedKey]:
@@ -103,7 +108,8 @@ class WorldModelLoss(LossModule):
         latent, states = self.predict(tensordict)
         read = latent
         # Of the windows of all processes, of which each has every N-th.
-        if blind := len(range(rank(), round(self.imagined * len(latent) * ranks()), ranks())):
+        first, count = (rank(), ranks()) if self.distributed else (0, 1)
+        if blind := len(range(first, round(self.imagined * len(latent) * count), count)):
             read, states = self._imagine(tensordict, latent, states, blind)
         return TensorDict(self.compare(tensordict, latent, states, read), [])
 
@@ -162,11 +168,15 @@ class WorldModelLoss(LossModule):
     ) -> torch.Tensor:
         """Return the mean of an error ``[B, T]`` over the valid steps that are known; 0 where there is none."""
         mean = self._reduce_loss(error, masks, mask=known, reduction="mean")
-        if known is None or ranks() == 1 or not torch.is_grad_enabled():
+        if known is None or not self.sums_over_ranks():
             return mean
         # Processes have different numbers of known steps; the mean of their losses is that of the whole batch.
         count = self._reduce_loss(torch.ones_like(error), masks, mask=known, reduction="sum")
         return mean * count / mean_over_ranks(count).clamp_min(1 / ranks())
+
+    def sums_over_ranks(self) -> bool:
+        """Return whether the loss is of a part of the batch that processes share."""
+        return self.distributed and ranks() > 1 and torch.is_grad_enabled()
 
     def _latent_error(self, latent, predicted, read) -> torch.Tensor:
         before, target = (latent if read is None else read)[:, :-1], latent[:, 1:]

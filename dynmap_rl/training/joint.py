@@ -106,7 +106,8 @@ def train_end_to_end(
     settings = settings or EndToEndTraining()
 
     def make(generator: torch.Generator) -> JointLoss:
-        return JointLoss(WorldModelLoss(world_model), policy, 1.0, settings.emphasis, end_to_end=True)
+        of_world_model = WorldModelLoss(world_model, distributed=True)
+        return JointLoss(of_world_model, policy, 1.0, settings.emphasis, end_to_end=True)
 
     def held_out() -> dict[str, float]:
         return _policy_loss(world_model, policy, episodes["eval"])

@@ -116,4 +116,4 @@ def make_loss(
     if isinstance(settings, WorldModelTraining):
         weights |= {"imagined": settings.imagined, "beta_rgb": settings.beta_rgb}
     frames = max(1, settings.rgb_frames // ranks())
-    return WorldModelLoss(world_model, **weights, rgb_frames=frames, generator=generator)
+    return WorldModelLoss(world_model, **weights, rgb_frames=frames, generator=generator, distributed=True)

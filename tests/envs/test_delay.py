@@ -152,6 +152,14 @@ def test_gymnasium_accepts_the_wrapped_tasks(obs_type):
     assert gym.make(env.spec, disable_env_checker=True).delay == env.delay
 
 
+@pytest.mark.filterwarnings("ignore:.*is different from the unwrapped version")
+def test_a_frame_may_be_a_dict():
+    env = gym.make("dynmap_rl/Task-v0", task="balance_reaching", disable_env_checker=True)
+    env = DelayFrames(env, FrameDelay(3, 2, 0.2))
+    assert isinstance(env.observation_space["pixels"], gym.spaces.Dict)
+    check_env(env, skip_render_check=True)
+
+
 def test_only_the_frame_is_late():
     arguments = {"obs_type": "pixels_agent_pos", "disable_env_checker": True}
     plain = gym.make("dynmap_rl/BalanceReaching-v1", **arguments)

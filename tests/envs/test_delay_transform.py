@@ -57,6 +57,24 @@ def test_a_used_transform_serves_an_environment_of_another_size():
     assert torch.equal(again["delay"], make_env(num_envs=2).rollout(5)["delay"])
 
 
+def test_a_clone_has_frames_of_its_own():
+    used, other = make_env(), DynmapBatchedEnv(num_envs=3, from_pixels=True, seed=1)
+    td = used.reset(scene_seed=SEEDS)
+    other = TransformedEnv(other, used.transform.clone())
+    rows, of_other = [], other.reset(scene_seed=SEEDS + 9)
+    for action in make_actions(8).unbind(1):
+        rows.append(td.select("pixels", "delay"))
+        of_other = other.step(of_other.set("action", -action))["next"]
+        td = used.step(td.set("action", action))["next"]
+    alone = play(make_env(), 8)
+    assert all(torch.equal(torch.stack(rows, 1)[key], alone[key]) for key in ("pixels", "delay"))
+
+
+def test_a_number_is_no_delay():
+    with pytest.raises(ValueError, match="FrameDelay"):
+        DelayTransform(6)
+
+
 def test_frames_are_those_of_the_steps_that_the_delays_name():
     on_time = play(DynmapBatchedEnv(num_envs=3, from_pixels=True))["pixels"]
     newest, bursts = play(make_env()), play(make_env(bursts=True))
@@ -122,7 +140,7 @@ def test_a_partial_reset_leaves_the_other_worlds_as_they_are(bursts):
 def test_each_episode_of_a_long_rollout_begins_with_its_own_first_frame(monkeypatch):
     monkeypatch.setattr(Task, "layout", replace(LAYOUT, steps=7))
     env = make_env(FrameDelay(4))
-    out = env.rollout(14, break_when_any_done=False)
+    out = env.rollout(14, lambda td: td.set("action", torch.zeros(3, 3)), break_when_any_done=False)
     assert out["delay"][0].flatten().tolist() == [0, 1, 2, 3, 4, 4, 4] * 2
     assert torch.equal(out["pixels"][:, 7], out["pixels"][:, 10])
     assert not torch.equal(out["pixels"][:, 6], out["pixels"][:, 7])

@@ -178,6 +178,18 @@ def test_a_recurrent_policy_goes_on_with_its_memory_from_a_step_of_a_rollout(fra
     torch.testing.assert_close(rest["action"], out["action"][:, 3:], rtol=1e-3, atol=1e-6)
 
 
+def test_a_start_is_copied(frames):
+    model = make_model()
+    start = make_start(model, frames)
+    env, kept = ImaginationEnv(model, start), start.clone()
+    start["latent"].add_(5)
+    start["goal"].add_(5)
+    assert all(torch.equal(env.reset()[key], kept[key]) for key in ("latent", "goal"))
+    td = env.reset(kept, set_state=True)
+    td["goal"].add_(5)
+    assert torch.equal(kept["goal"], frames["goal"][:, -1])
+
+
 def test_the_start_moves_with_the_environment(frames):
     env = ImaginationEnv(make_model(), make_start(make_model(), frames))
     env.action_spec = env.observation_spec["latent"].clone()  # bounds cannot be checked without values

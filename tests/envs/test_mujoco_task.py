@@ -319,6 +319,30 @@ def test_the_experts_of_the_benchmarks_succeed(name):
     assert solved >= 8
 
 
+def test_what_is_dropped_stays_dropped(own_task, monkeypatch):  # noqa: F811
+    task, lost = get_task(own_task), [False, True, False]
+    monkeypatch.setattr(type(task), "is_dropped", lambda self, world: lost.pop(0))
+    world, seen = task.begin(0), []
+    while lost:
+        task.step([world], [np.zeros(len(task.layout.action))])
+        seen.append(world.dropped)
+    assert seen == [False, True, True]
+
+
+@pytest.mark.slow
+def test_an_object_off_the_table_is_dropped():
+    check_renderer()
+    pytest.importorskip("gymnasium_robotics")
+    task = get_task("mujoco:FetchPush")
+    for height, dropped in ((0.45, False), (0.2, True)):
+        world = task.begin(0)
+        world.data.joint("object0:joint").qpos[:3] = (
+            (1.3, 0.75, height) if not dropped else (0.6, 0.2, height)
+        )
+        task.step([world], [np.zeros(4)])
+        assert world.dropped is dropped
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", BENCHMARKS)
 def test_the_benchmarks_repeat_bit_by_bit(name):

@@ -102,6 +102,21 @@ def test_impossible_ranges_raise():
         sample_scene(np.random.default_rng(0), SceneRanges(min_contrast=500.0))
 
 
+@pytest.mark.parametrize(
+    "ranges",
+    [
+        {"friction": (0.9, 0.1)},
+        {"friction": 0.5},
+        {"cart_width": (math.nan, 1.0)},
+        {"background_color": (255, 180)},
+        {"cart_x": (0.5,)},
+    ],
+)
+def test_a_range_is_two_numbers(ranges):
+    with pytest.raises(ValueError, match=next(iter(ranges))):
+        SceneRanges(**ranges)
+
+
 def test_splits_never_share_a_seed():
     ends = sorted((scene_seed(s, 0), scene_seed(s, SEEDS_PER_SPLIT - 1)) for s in SPLITS)
     assert all(last < first for (_, last), (first, _) in pairwise(ends))
@@ -158,6 +173,10 @@ def test_impossible_scene_raises(kind, factor):
         {"density": math.inf},
         {"friction": -1.0},
         {"block_shift": math.nan},
+        {"cart_color": (0.9, 0.9, 0.9)},
+        {"block_color": (300, -1, 0)},
+        {"background_color": (1, 2)},
+        {"cart_color": "red"},
     ],
 )
 def test_impossible_factors_are_refused(factor):

@@ -132,7 +132,7 @@ def test_a_renderer_may_draw_into_one_array(monkeypatch):
 @every_task
 def test_partial_reset_touches_only_the_masked_worlds(task):
     env = DynmapBatchedEnv(task, num_envs=3, seed=0)
-    td = env.rollout(5)[:, -1]["next"].exclude("reward")
+    td = env.rollout(5, break_when_any_done=False)[:, -1]["next"].exclude("reward")
     worlds = list(env.worlds)
     mask = torch.tensor([[False], [True], [False]])
     after = env.reset(td.clone().set("_reset", mask))

@@ -150,6 +150,10 @@ def test_errors_of_the_predicted_position_by_hand():
     [row] = episode_rows(TensorDict(data, [1, 4]), [7])
     assert row["localization_error"] == pytest.approx(0.02)
     assert row["localization_error_away"] == pytest.approx(0.015)
+    data["goal"], position[0, :, 2], predicted[0, :, 2] = torch.zeros(1, 4, 3), 0.0, 0.04
+    [row] = episode_rows(TensorDict(data, [1, 4]), [7])
+    assert row["localization_error"] == pytest.approx((0.0017**0.5 + 0.002**0.5 + 0.05) / 3, abs=1e-5)
+    data["goal"] = goal
     position[:] = 0
     assert "localization_error_away" not in episode_rows(TensorDict(data, [1, 4]), [7])[0], (
         "always near the goal"
@@ -165,6 +169,20 @@ def test_predictions_are_those_of_the_frames_and_actions():
     predicted = found["predicted_dynamics", "position"]
     torch.testing.assert_close(predicted[:, 1:], expected[:, 1:], rtol=1e-3, atol=1e-3)
     assert not predicted[:, 0].any()
+
+
+def test_an_actor_may_have_keys_of_its_own():
+    actor = make_actor()
+    names = {"predicted_latent": "predicted", "memory": ("h1", "c1", "h2", "c2")}
+    renamed = Actor(actor.world_model, actor.policy, mixed=True, **names)
+    seeds = scene_seeds("validation", 1)
+    plain, other = (roll_out(a, "balance_reaching", seeds) for a in (actor, renamed))
+    assert torch.equal(plain["predicted_dynamics", "position"], other["predicted_dynamics", "position"])
+
+
+def test_an_actor_that_would_use_no_frame_is_refused():
+    with pytest.raises(ValueError, match="max_delay of the actor must be at least 6"):
+        roll_out(DelayedActor(make_actor(), max_delay=5), "balance_reaching", [0], delay=FrameDelay(7, 1))
 
 
 def test_pushes_act_on_the_cart_but_the_actor_is_not_told():

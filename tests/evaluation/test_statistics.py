@@ -188,3 +188,9 @@ def test_gap_of_gaps_is_their_difference():
     a, b, c, d = (rows(count) for count in (9, 4, 6, 5))
     found = outcome_gap([(1, [a, a]), (-1, [b]), (-1, [c]), (1, [d, d, d])])
     assert found["gap"] == pytest.approx(50 - 10)
+
+
+def test_flags_may_be_those_of_numpy():
+    a, b = rows(9), rows(4)
+    numpy = [[{**row, "success": np.bool_(row["success"])} for row in part] for part in (a, b)]
+    assert gap_of([numpy[0]], [numpy[1]]) == gap_of([a], [b])

@@ -105,7 +105,7 @@ def test_without_frames_the_actor_imagines_as_the_imagination_environment(kind):
         for key in ("latent", "action", *MEMORY):
             torch.testing.assert_close(td[key], expected[key][:, t], rtol=1e-5, atol=1e-6)
         td = td["next"].set("goal", start["goal"])
-    with pytest.raises(KeyError, match="predicted_latent"):
+    with pytest.raises(KeyError, match="from_pixels"):
         actor(start.select("goal"))
 
 
@@ -150,7 +150,14 @@ def test_an_environment_that_does_not_pass_the_memory_on_is_refused(make):
         env.rollout(3, make())
 
 
-@pytest.mark.parametrize("make", [make_actor, lambda: LatentActor(make_actor().policy)])
+@pytest.mark.parametrize(
+    "make",
+    [
+        make_actor,
+        lambda: LatentActor(make_actor().policy),
+        lambda: DelayedActor(make_actor(), max_delay=2),
+    ],
+)
 def test_an_actor_without_memory_warns(make):
     actor = make()
     td = TensorDict(
@@ -181,3 +188,19 @@ def test_a_goal_of_another_type_is_the_same_goal(kind):
 def test_windows_are_refused_in_recurrent_mode():
     with set_recurrent_mode(True), pytest.raises(RuntimeError, match="make_world_model_module"):
         make_actor()(make_frames())
+
+
+def test_memory_that_a_part_of_the_batch_lacks_is_missed():
+    td = make_frames()[:, 0].select("pixels", "goal").set("is_init", torch.tensor([[True], [False]]))
+    with pytest.raises(KeyError, match="make_tensordict_primer"):
+        make_actor()(td)
+
+
+def test_a_policy_of_another_class_has_no_memory():
+    class Policy(torch.nn.Module):
+        def step(self, latent, hidden1, hidden2, goal, state):
+            return goal, (goal,)
+
+    actor, frames = make_actor(), make_frames()
+    with pytest.raises(TypeError, match="RecurrentPolicy, got Policy"):
+        Actor(actor.world_model, Policy())(frames[:, 0].select("pixels", "goal"))

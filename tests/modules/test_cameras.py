@@ -73,3 +73,13 @@ def test_glimpses_and_sprites_cover_the_same_part_of_larger_frames():
 def test_sizes_that_do_not_fit_are_refused(size, cameras):
     with pytest.raises(ValueError, match="multiple of 8"):
         make(image_size=size, cameras=cameras)
+
+
+@torch.no_grad()
+def test_latents_of_cameras_are_rolled_and_added():
+    """Saved models of several cameras depend on it."""
+    model, pixels = make(cameras=2).eval(), draw(1, 3, 64, 128)
+    first, second = (
+        encoder(part) for encoder, part in zip(model.encoder.encoders, pixels.split(64, -1), strict=True)
+    )
+    torch.testing.assert_close(model.encode(pixels), first + second.roll(4, -1))

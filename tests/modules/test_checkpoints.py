@@ -120,5 +120,6 @@ def test_other_folders_are_named(saved, tmp_path):
 def test_unknown_names_are_refused():
     with pytest.raises(ValueError, match="transformer"):
         make_policy(CONSTANTS, "transformer", make_model())
-    with pytest.raises(KeyError, match="jerk"):
-        make_world_model(CONSTANTS, ("jerk",))
+    for supervision in (("jerk",), "position"):
+        with pytest.raises(ValueError, match="supervision must be a sequence"):
+            make_world_model(CONSTANTS, supervision)

@@ -112,3 +112,8 @@ def test_a_step_beyond_the_last_chunk_may_be_repeated():
 def test_a_delay_must_be_shorter_than_a_chunk(size, delay):
     with pytest.raises(ValueError, match="delay must be between 0 and size - 1"):
         ChunkActor(make_actor("feedforward"), size, delay)
+
+
+def test_it_needs_an_actor_without_delays():
+    with pytest.raises(TypeError, match="must be an Actor, got DelayedActor"):
+        ChunkActor(DelayedActor(make_actor("feedforward")), size=4)

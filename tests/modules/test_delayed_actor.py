@@ -133,6 +133,23 @@ def test_once_all_frames_have_arrived_their_way_does_not_matter(name):
 
 
 @torch.no_grad()
+def test_of_several_frames_of_one_step_the_last_is_used():
+    actor, frames = DelayedActor(make_actor(), max_delay=2), make_frames()
+    entries = {"pixels": frames[:, :2], "delay": torch.zeros(2, 2, dtype=torch.int64)}
+    latent = run(actor, [entries])["latent"][:, 0]
+    torch.testing.assert_close(latent, actor.world_model.encode(frames[:, 1]))
+    assert not torch.allclose(latent, actor.world_model.encode(frames[:, 0]))
+
+
+def test_an_episode_begins_with_a_frame():
+    env = DynmapBatchedEnv(num_envs=2)
+    actor = DelayedActor(make_actor(), max_delay=2)
+    env = TransformedEnv(env, Compose(InitTracker(), actor.make_tensordict_primer()))
+    with pytest.raises(KeyError, match="from_pixels=True"):
+        env.rollout(3, actor)
+
+
+@torch.no_grad()
 def test_frames_that_are_too_late_or_of_another_episode_are_lost():
     actor, frames = make_actor(), make_frames()
     lost = run(DelayedActor(actor, max_delay=2), send(frames, [[0], [], [], [2], [], [4], [], [], []]))

@@ -224,3 +224,10 @@ def test_wrong_use_gets_one_clear_error():
         RobotActor(make_actor(max_delay=0))
     with pytest.raises(ValueError, match="period"):
         RobotActor(make_actor(), period=0)
+
+
+def test_it_needs_an_actor_with_delays():
+    model = make_model()
+    actor = Actor(model, make_policy(CONSTANTS, "feedforward", model, width=20))
+    with pytest.raises(TypeError, match="must be a DelayedActor, got Actor"):
+        RobotActor(actor)

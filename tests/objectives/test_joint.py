@@ -5,6 +5,7 @@ import torch
 from small import CONSTANTS, make_episodes, make_model
 
 from dynmap_rl.modules.checkpoints import make_policy
+from dynmap_rl.objectives import joint, world_model
 from dynmap_rl.objectives.imitation import imitation_loss
 from dynmap_rl.objectives.joint import JointLoss
 from dynmap_rl.objectives.world_model import WorldModelLoss
@@ -76,3 +77,13 @@ def test_disturbed_steps_do_not_count_for_the_policy(td):
     td["action"][:, -1] += 1.0
     assert ignored != plain
     assert loss(td)["loss_policy"].item() == pytest.approx(ignored)
+
+
+def test_a_loss_does_not_wait_for_other_processes(td, monkeypatch):
+    """A group of processes may belong to a collector, whose other processes compute no losses."""
+    for module in (joint, world_model):
+        monkeypatch.setattr(module, "mean_over_ranks", None)
+    monkeypatch.setattr(world_model, "ranks", lambda: 2)
+    loss, *_ = make()
+    td["labelled"] = torch.rand(*td.shape, 1) > 0.5
+    assert loss(td)["loss_position"].isfinite()

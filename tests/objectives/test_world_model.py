@@ -200,7 +200,7 @@ def test_only_the_first_windows_are_imagined_and_from_any_step_on(monkeypatch):
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 6, 12])
 def test_as_many_windows_are_imagined_in_any_number_of_processes(monkeypatch, count):
-    model, loss = make(("position",), imagined=0.5)
+    model, loss = make(("position",), imagined=0.5, distributed=True)
     td, imagined = batch(b=12 // count), []
     imagine = model.transition.imagine
     monkeypatch.setattr(

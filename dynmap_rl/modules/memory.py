@@ -1,0 +1,83 @@
+"""Memory of actors in TensorDicts: read where it is, zero where an episode begins, written under ``next``."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey, unravel_key
+from torchrl.data import Composite, Unbounded
+from torchrl.envs import TensorDictPrimer
+from torchrl.modules import recurrent_mode
+
+if TYPE_CHECKING:
+    from .actor import Actor
+
+
+def recall(tensordict: TensorDictBase, sizes: dict, is_init: NestedKey, device) -> tuple[torch.Tensor, ...]:
+    """Return the entries of ``sizes``; zeros where an episode begins, and where they and ``is_init`` are absent."""
+    batch, begins = tensordict.batch_size, tensordict.get(is_init, None)
+    check_memory(tensordict, sizes, begins)
+    state = tuple(tensordict.get(k, torch.zeros(*batch, n, device=device)) for k, n in sizes.items())
+    return state if begins is None else tuple(s.masked_fill(begins, 0.0) for s in state)
+
+
+def check_frame(actor: Actor, predicted: bool) -> None:
+    """Raise ``KeyError`` where there is no predicted latent in the place of a frame."""
+    if not predicted:
+        raise KeyError(
+            f"there is no frame {actor.pixels!r} and no latent that was predicted before it; environments of this package "
+            "need from_pixels=True"
+        )
+
+
+def check_memory(tensordict: TensorDictBase, keys: Iterable[NestedKey], begins: torch.Tensor | None) -> None:
+    """Check that memory is there, except where episodes begin, and that the call is of one time step.
+
+    Raises:
+        KeyError: the environment does not pass the memory on.
+        RuntimeError: TorchRL's recurrent mode is on, in which modules read whole windows.
+    """
+    if recurrent_mode():
+        raise RuntimeError(
+            "an actor reads one time step; windows are for make_world_model_module and make_policy_module"
+        )
+    missing = [key for key in keys if tensordict.get(key, None) is None]
+    if missing and begins is not None and not begins.all():
+        raise KeyError(
+            f"{missing[0]} is missing after the first step; append actor.make_tensordict_primer() to the environment"
+        )
+
+
+def warn_without_memory(
+    actor: TensorDictModuleBase, tensordict: TensorDictBase, keys: Iterable[NestedKey]
+) -> None:
+    """Warn if neither memory nor the start of episodes is there in two calls in a row, as in an environment without both."""
+    blind = (
+        any(tensordict.get(key, None) is None for key in keys) and tensordict.get(actor.is_init, None) is None
+    )
+    if blind and actor.blind:
+        warnings.warn(
+            "the actor had no memory in two calls in a row; append InitTracker() and actor.make_tensordict_primer() to the "
+            "environment, or pass on what is written under next",
+            stacklevel=3,
+        )
+    actor.blind = blind
+
+
+def remember(tensordict: TensorDictBase, keys, values) -> None:
+    """Write values under ``next``."""
+    for key, value in zip(keys, values, strict=True):
+        tensordict.set(unravel_key(("next", key)), value)
+
+
+def make_primer(sizes: dict[NestedKey, int]) -> TensorDictPrimer:
+    """Make the transform that gives an environment entries of these sizes, zero at every reset."""
+    specs = Composite()
+    for key, size in sizes.items():
+        specs[key] = Unbounded((size,))
+    return TensorDictPrimer(specs, default_value=0.0, expand_specs=True)
