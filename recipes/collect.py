@@ -45,7 +45,7 @@ class Config:
 def main(config: Config) -> None:
     """Record, report and upload."""
     from dynmap_rl.data.demonstrations import META, load_meta
-    from dynmap_rl.data.format.hub import push_dataset
+    from dynmap_rl.data.format.hub import check_uploadable, push_dataset
     from dynmap_rl.data.recording.record import record_dataset
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.reporting.dataset_page import write_dataset_page
@@ -53,6 +53,8 @@ def main(config: Config) -> None:
 
     suffix = "" if config.kind == "demonstrations" else f"_{config.kind}"
     output = config.output or Path("datasets") / f"{get_task(config.task).name}{suffix}"
+    if config.push_to_hub:
+        check_uploadable(config.task)
     complete = (output / META).exists()
     sizes = config.episodes, config.eval_episodes
     record_dataset(output, config.task, config.kind, *sizes, config.workers, config.expert, config.launcher)

@@ -60,7 +60,7 @@ def main(config: Config) -> None:
     """Play, record and upload."""
     import torch
 
-    from dynmap_rl.data.format.hub import push_dataset
+    from dynmap_rl.data.format.hub import check_uploadable, push_dataset
     from dynmap_rl.data.recording.human import list_shards, next_scene, open_folder, publish_episodes
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.play.session import MAX_DELAY, Session
@@ -90,6 +90,8 @@ def main(config: Config) -> None:
         raise ValueError("--gif needs --steps, the length of the animation")
     if config.push_to_hub and not config.record:
         raise ValueError("--push_to_hub needs --record, the folder of the demonstrations")
+    if config.push_to_hub:
+        check_uploadable(task)
     kept, first = 0, config.scene
     if config.record:
         open_folder(config.record, task)

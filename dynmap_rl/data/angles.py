@@ -14,7 +14,9 @@ def align_turns(angle: np.ndarray, rows: list[slice], period: float) -> None:
 
     The mean of each episode is moved to within half a turn of the mean direction of all.
     """
-    center = _direction(angle, period)
+    from scipy.stats import circmean
+
+    center = circmean(angle, period / 2, -period / 2, axis=0)
     for own in rows:
         angle[own] -= period * np.round((angle[own].mean(0) - center) / period)
 
@@ -26,6 +28,8 @@ def align_axes(angle: np.ndarray, episodes: list[tuple[slice, Motion]]) -> None:
     whichever is nearer at the start of most episodes, and begins within a quarter of a turn of it; within an eighth for an
     object that is less than :data:`ELONGATED` times as long as wide.
     """
+    from scipy.stats import circmean
+
     for n, column in enumerate(angle.T):
         found = [np.flatnonzero(motion.found[:, n])[:5] for _, motion in episodes]
         start = np.array(
@@ -33,11 +37,6 @@ def align_axes(angle: np.ndarray, episodes: list[tuple[slice, Motion]]) -> None:
         )
         long = np.median([motion.tracks.elongation[n] for _, motion in episodes]) > ELONGATED
         period = np.pi if long else np.pi / 2
-        axis = np.pi / 2 * np.round(_direction(start, period) / (np.pi / 2))
+        axis = np.pi / 2 * np.round(circmean(start, period / 2, -period / 2) / (np.pi / 2))
         for (own, _), first in zip(episodes, start, strict=True):
             column[own] -= axis + period * np.round((first - axis) / period)
-
-
-def _direction(angle: np.ndarray, period: float) -> np.ndarray:
-    """Return the mean direction of angles over the first dimension."""
-    return np.angle(np.exp(2j * np.pi * angle / period).mean(0)) * period / (2 * np.pi)

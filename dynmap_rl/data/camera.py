@@ -112,7 +112,9 @@ def choose_view(
         raise ValueError(f"--threshold must be 1 to 255, got {threshold}")
     if sort not in SORTS:
         raise ValueError(f"--sort must be one of {', '.join(SORTS)}, got {sort!r}")
-    width = 1.0 if width is None and planar else width
+    if planar and width not in (None, 1):
+        raise ValueError(f"--width must be 1 for a recording of cart and block, got {width}")
+    width = 1.0 if planar else width
     if width is not None and not 0 < width < math.inf:
         raise ValueError(f"--width must be above 0, got {width}")
     column = choose_camera(root, info, camera)

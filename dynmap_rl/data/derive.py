@@ -159,7 +159,8 @@ def add_dynamics(
         view = choose_view(root, info, source.removeprefix("state,"), planar, **frames)
         parts.append((view.names, read_motion(root, info, view), method or "savgol"))
     names = [name for part in parts for name in part[0]]
-    if planar and view and view.names == FrameSource("tracks", "", len(BODIES) // 3).names == names:
+    ordered = view and view.sort == "lowest" and not view.colors  # the cart is below the block
+    if planar and ordered and view.names == FrameSource("tracks", "", len(BODIES) // 3).names == names:
         names = list(BODIES)
         parts = [(names, *parts[0][1:])]
     if len(set(names)) < len(names):

@@ -14,6 +14,7 @@ import numpy as np
 
 from .motion import Motion
 
+EXPLAINED = 0.25  # share of the variance of colours that remains where objects have only changed places
 SMOOTH = 7, 2  # window and order of the smooth trajectory
 
 # name: (limit, whether larger is worse, what is measured, advice)
@@ -56,6 +57,10 @@ LIMITS = {
         0.07, True, "distance of an angle from a smooth trajectory, root mean square (rad)",
         "film from nearer, or use --point true for tracks without angles: a round object has none; only velocities gain by "
         "--method savgol with a longer --window",
+    ),
+    "order": (
+        0.005, True, "share of the episodes in which an object has the colour that another one has in most",
+        "name the objects by their --colors, or choose another --sort",
     ),
     "agreement": (
         0.7, False, "correlation of the tracks' velocity with that of the optical flow",
@@ -106,6 +111,9 @@ def judge_quality(derived: Sequence[Derived]) -> dict:
         row = rows.setdefault(part.episode, {})
         for name, values in _measure(part, means).items():
             row.setdefault(name, {}).update(values)
+    tracked = [part for part in derived if part.motion.tracks and part.motion.found.shape[1] > 1]
+    for part, swapped in zip(tracked, _swapped([part.motion.tracks.color for part in tracked]), strict=True):
+        rows[part.episode]["order"] = {"objects": float(swapped)}
     checks = {}
     for name, (limit, more, what, advice) in LIMITS.items():
         found = [row[name] for row in rows.values() if row.get(name)]
@@ -182,6 +190,27 @@ def _measure(episode: Derived, extents: dict[str, float]) -> dict[str, dict[str,
             for n, body in enumerate(bodies)
         }
     return result
+
+
+def _swapped(colors: list[np.ndarray]) -> np.ndarray:
+    """Return for each episode whether its objects, whose colours are ``[N, 3]``, have changed places.
+
+    Where colours differ from episode to episode for another reason, another order explains little of it.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    if len(colors) < 3:  # two episodes of any colours may look alike
+        return np.zeros(len(colors), dtype=bool)
+    given = np.array(colors, float)  # (E, N, 3)
+    center = given[0]
+    for _ in range(5):
+        cost = np.square(given[:, :, None] - center).sum(-1)  # (E, N, N)
+        order = np.array([linear_sum_assignment(own.T)[1] for own in cost])
+        sorted_ = np.take_along_axis(given, order[..., None], 1)
+        center = sorted_.mean(0)
+    explained = sorted_.var(0).sum() < EXPLAINED * given.var(0).sum()
+    usual = max(map(tuple, order), key=[*map(tuple, order)].count)
+    return (order != usual).any(1) & explained
 
 
 def _bodies(names: Sequence[str], count: int) -> list[str]:

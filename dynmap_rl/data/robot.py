@@ -105,7 +105,7 @@ def load_robot_dataset(
         every quantity of the dynamics). Pieces are ``[P, T]``: ``pixels`` uint8 ``[P, T, 3, S, cameras * S]``, ``action``
         ``[P, T, A]``, ``goal`` ``[P, T, G]`` (G = 0 without a goal), ``("dynamics", quantity)`` ``[P, T, D]`` for the
         columns that the dataset has, float32 in its units, ``disturbed`` bool ``[P, T, 1]`` where the dataset has such a
-        column of flags, ``labelled`` bool ``[P, T, D]`` likewise (see :func:`dynmap_rl.data.load_dataset`), ``episode`` int64 ``[P, T]``, the
+        column of flags, ``expert_action`` ``[P, T, A]``, the action to imitate, likewise, ``labelled`` bool ``[P, T, D]`` likewise (see :func:`dynmap_rl.data.load_dataset`), ``episode`` int64 ``[P, T]``, the
         episode's index, and ``step_count`` int64 ``[P, T, 1]``, the number of the step in its episode.
 
     Raises:
@@ -140,6 +140,9 @@ def _read_numbers(layout: dict) -> tuple[dict, dict[int, slice]]:
     pushes = info["features"].get("disturbed", {})
     if (pushes.get("dtype"), pushes.get("shape")) == ("bool", [1]):
         columns["disturbed"] = "disturbed"
+    expert = info["features"].get("expert_action")
+    if expert and is_vector(expert) and expert["shape"] == info["features"]["action"]["shape"]:
+        columns["expert_action"] = "expert_action"
     if FOUND in info["features"]:
         columns["labelled"] = FOUND
     goal, entries = layout["goal"] or ("action", [])

@@ -13,12 +13,10 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
+from .segmentation import faintest, find_colors, find_moving, split_colors
+
 SAMPLES = 51  # frames whose median is the background; odd, so that every median is a value of a frame
 WIDEST = 160  # pixels that frames are reduced to, as the centroid is finer than a pixel
-BINS = 16  # levels of a colour channel in histograms
-SPARE = 3  # colours besides those of the objects: shadows, edges, and places that were taken for background
-FAINTEST = 0.3  # share of the usual area from which on an object counts as found
-RAREST = 0.1  # share of the frames in which a colour must be seen to be that of an object
 SORTS = "lowest", "largest", "brightest"
 
 
@@ -34,6 +32,7 @@ class Tracks:
         cut: bool ``[T, N]``, whether the object touches the border of the picture.
         labels: uint8 ``[T, height, width]``, number of the object of a pixel from 1 on, 0 elsewhere.
         elongation: ratio of the axes of each object, ``[N]``, the median over the frames.
+        color: mean colour of each object (RGB, 0 to 255), ``[N, 3]``.
         moving: share of the pixels that ever differ from the background.
     """
 
@@ -43,6 +42,7 @@ class Tracks:
     cut: np.ndarray
     labels: np.ndarray
     elongation: np.ndarray
+    color: np.ndarray
     moving: float
 
 
@@ -126,12 +126,12 @@ def track_objects(
             "every pixel changes; the camera must stand still and the light must not change, or raise --threshold"
         )
     if colors is None:
-        labels = _split(frames, _moving(frames, changed, ever), objects, threshold)
+        labels = split_colors(frames, find_moving(frames, changed, ever), objects, threshold)
     else:
-        labels, objects = _find_colors(frames, ever, colors, threshold), len(colors)
+        labels, objects = find_colors(frames, ever, colors, threshold), len(colors)
     regions = [[_measure(frame_labels, n) for n in range(1, objects + 1)] for frame_labels in labels]
     area = np.array([[region[1] for region in row] for row in regions], float)
-    found = area >= np.array([_faintest(column) for column in area.T])
+    found = area >= np.array([faintest(column) for column in area.T])
     if missing := np.flatnonzero(~found.any(0)).tolist():
         if colors is None:
             raise ValueError(f"must have {objects} objects that move, got fewer; use fewer --objects")
@@ -142,15 +142,14 @@ def track_objects(
         )
     pose = np.array([[region[0] for region in row] for row in regions])
     elongation = np.array([[region[3] for region in row] for row in regions])
-    elongation = np.array(
-        [np.median(column[seen]) for column, seen in zip(elongation.T, found.T, strict=True)]
-    )
+    elongation = _medians(elongation, found)
     cut = np.array([[region[2] for region in row] for row in regions]) & found
     for n in range(objects):
         seen = found[:, n]
         pose[seen, n, 2] = np.unwrap(pose[seen, n, 2], period=np.pi)  # an axis has no direction
         pose[:, n] = fill_gaps(pose[:, n], found[:, n])
-    order = range(objects) if colors else _order(sort, pose, area, found, frames, labels)
+    color = np.array([frames[labels == n + 1].mean(0) for n in range(objects)])
+    order = range(objects) if colors else _order(sort, pose, area, found, color)
     numbers = np.zeros(objects + 1, np.uint8)
     numbers[np.asarray(order) + 1] = np.arange(1, objects + 1)
     return Tracks(
@@ -160,6 +159,7 @@ def track_objects(
         cut[:, order],
         numbers[labels],
         elongation[order],
+        color[order],
         float(ever.mean()),
     )
 
@@ -168,91 +168,6 @@ def fill_gaps(values: np.ndarray, found: np.ndarray) -> np.ndarray:
     """Interpolate values ``[T, D]`` linearly where they were not found; the ends repeat the nearest value."""
     time = np.arange(len(values))
     return np.stack([np.interp(time, time[found], column[found]) for column in values.T], 1)
-
-
-def _moving(frames: np.ndarray, changed: np.ndarray, ever: np.ndarray) -> np.ndarray:
-    """Return masks ``[T, height, width]`` of what moves, by colour."""
-    colors = (frames // (256 // BINS)).astype(np.int32) @ np.array([BINS**2, BINS, 1], np.int32)
-    never = np.broadcast_to(~ever, colors.shape)
-    moving, still = (np.bincount(colors[where], minlength=BINS**3) for where in (changed, never))
-    likely = moving / moving.sum() > still / still.sum()
-    masks = likely[colors]
-    for mask in masks:  # what never changes may have the same colour
-        mask &= _touched(mask, ever)
-    return masks
-
-
-def _touched(mask: np.ndarray, ever: np.ndarray) -> np.ndarray:
-    """Return the regions of a mask ``[height, width]`` that contain pixels which ever change."""
-    count, regions = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
-    return (np.bincount(regions[ever & mask], minlength=count) > 0)[regions]
-
-
-def _find_colors(
-    frames: np.ndarray, ever: np.ndarray, colors: Sequence[tuple[int, int, int]], threshold: int
-) -> np.ndarray:
-    """Return the number of the object of every pixel by given colours, uint8 ``[T, height, width]``; 0 is none."""
-    seen, moving = np.zeros((2, *frames.shape[:3]), np.uint8)
-    for t, frame in enumerate(frames):
-        distance = np.stack([cv2.absdiff(frame, np.full_like(frame, color)).max(2) for color in colors])
-        nearest = distance.argmin(0)
-        for n in range(len(colors)):
-            mask = (nearest == n) & (distance[n] < threshold)
-            seen[t][mask] = n + 1
-            moving[t][mask & _touched(mask, ever)] = n + 1
-    for n in range(1, len(colors) + 1):
-        if not (moving == n).any():  # the object rests in the whole episode
-            moving[seen == n] = n
-    return moving
-
-
-def _split(frames: np.ndarray, masks: np.ndarray, objects: int, threshold: int) -> np.ndarray:
-    """Return the number of the object of every pixel, uint8 ``[T, height, width]``; 0 is none."""
-    if objects == 1:
-        return masks.astype(np.uint8)
-    few = f"must have {objects} objects of different colours that move, got fewer; use fewer --objects"
-    pixels = frames[masks].astype(np.float32)
-    sample = pixels[:: max(1, len(pixels) // 20_000)]
-    if (count := len(np.unique(sample, axis=0))) < objects:
-        raise ValueError(few)
-    cv2.setRNGSeed(0)
-    criteria = cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 0.5
-    count = min(objects + SPARE, count)
-    _, _, centers = cv2.kmeans(sample, count, None, criteria, 3, cv2.KMEANS_PP_CENTERS)
-    merged = _merge(centers, threshold)
-    nearest = np.full(masks.shape, len(centers), np.uint8)
-    nearest[masks] = merged[np.square(pixels[:, None] - centers).sum(-1).argmin(1)]
-    motion = [_motion(nearest == k) for k in range(len(centers))]
-    chosen = np.argsort(motion)[::-1][:objects]
-    if not np.take(motion, chosen).all():
-        raise ValueError(few)
-    numbers = np.zeros(len(centers) + 1, np.uint8)
-    numbers[chosen] = np.arange(1, objects + 1)
-    return numbers[nearest]
-
-
-def _merge(centers: np.ndarray, threshold: int) -> np.ndarray:
-    """Return for each colour the number of its group: colours that differ by less than the threshold, in chains."""
-    from scipy.sparse.csgraph import connected_components
-
-    close = np.abs(centers[:, None] - centers).max(-1) < threshold
-    return connected_components(close)[1].astype(np.uint8)
-
-
-def _motion(masks: np.ndarray) -> float:
-    """Return how much a colour moves: the spread of its centre times the root of its area, 0 for a rare colour."""
-    area = masks.sum((1, 2))
-    seen = area >= _faintest(area)
-    if seen.mean() < RAREST:
-        return 0.0
-    centers = np.array([np.argwhere(mask).mean(0) for mask in masks[seen]])
-    spread = np.linalg.norm(np.quantile(centers, 0.95, axis=0) - np.quantile(centers, 0.05, axis=0))
-    return float(spread * np.sqrt(np.median(area[seen])))
-
-
-def _faintest(area: np.ndarray) -> float:
-    """Return the area from which on an object counts as found, given its area in all frames."""
-    return max(4.0, FAINTEST * float(np.median(area[area > 0]))) if area.any() else np.inf
 
 
 def _measure(labels: np.ndarray, n: int) -> tuple[tuple[float, float, float], int, bool, float]:
@@ -272,15 +187,17 @@ def _measure(labels: np.ndarray, n: int) -> tuple[tuple[float, float, float], in
     return (x, y, angle), int(area), bool(cut), float(np.sqrt((both + apart) / max(both - apart, 1e-9)))
 
 
-def _order(sort: str, pose, area, found, frames, labels) -> list[int]:
-    count = pose.shape[1]
-    if sort == "lowest":
-        values = -pose[0, :, 1]
-    elif sort == "largest":
-        values = -np.array([np.median(area[found[:, n], n]) for n in range(count)])
-    else:
-        values = -np.array([frames[labels == n + 1].mean() for n in range(count)])
-    return np.argsort(values, kind="stable").tolist()
+def _order(sort: str, pose, area, found, color) -> list[int]:
+    values = {
+        "lowest": pose[0, :, 1],
+        "largest": _medians(area, found),
+        "brightest": color.mean(1),
+    }[sort]
+    return np.argsort(-values, kind="stable").tolist()
+
+
+def _medians(values: np.ndarray, found: np.ndarray) -> np.ndarray:
+    return np.array([np.median(column[seen]) for column, seen in zip(values.T, found.T, strict=True)])
 
 
 def _background(frames: np.ndarray, threshold: int) -> np.ndarray:

@@ -58,20 +58,22 @@ def plot_reconstruction(
 
 
 def plot_dynamics(
-    world_model: WorldModel, episode: TensorDictBase, path: Path, layout: Layout = LAYOUT
+    world_model: WorldModel, episode: TensorDictBase, path: Path, layout: Layout = LAYOUT, units: bool = True
 ) -> None:
-    """Draw true and predicted dynamics along one episode ``[T]``; nothing for an Only-RGB model.
+    """Draw true and predicted dynamics along one episode ``[T]``; nothing for a model without any, or with other entries.
 
     Args:
         world_model: world model that predicts.
         episode: one episode.
         path: file to write.
         layout: sizes and names of the task; of cart and block, the block is drawn, otherwise the first body.
+        units: whether the entries are in SI units, as tracks in pixels are not.
     """
-    if not world_model.supervision:
+    own = {quantity: episode["dynamics", quantity].shape[-1] for quantity in world_model.supervision}
+    if not own or own != world_model.sizes:
         return
     figure = plt.figure(figsize=(9, 2.2 * len(world_model.supervision)))
-    draw_dynamics(figure, predict(world_model, episode[None])[0], world_model.supervision, layout)
+    draw_dynamics(figure, predict(world_model, episode[None])[0], world_model.supervision, layout, units)
     save_figure(figure, path)
 
 
@@ -145,7 +147,9 @@ def draw_reconstruction(figure, out: TensorDictBase, steps: list[list[int]], dt:
         axis.set(xticks=[], yticks=[])
 
 
-def draw_dynamics(figure, out: TensorDictBase, supervision: tuple[str, ...], layout: Layout = LAYOUT) -> None:
+def draw_dynamics(
+    figure, out: TensorDictBase, supervision: tuple[str, ...], layout: Layout = LAYOUT, units: bool = True
+) -> None:
     """Draw the dynamics of a body along one episode ``[T]`` (see :func:`predict`), a row for each quantity."""
     time, first = np.arange(out.shape[0]) * layout.dt, 3 if layout == LAYOUT else 0
     count = min(3, len(layout.position) - first)  # a point has two entries
@@ -154,11 +158,11 @@ def draw_dynamics(figure, out: TensorDictBase, supervision: tuple[str, ...], lay
         for column in range(count):
             axis, index = axes[row, column], first + column
             body, _, component = layout.dynamics[quantity][index].rpartition("_")
-            unit = UNITS[quantity][2 if component == "theta" else 0]
+            unit = f" [{UNITS[quantity][2 if component == 'theta' else 0]}]" if units else ""
             axis.plot(time, out["dynamics", quantity][:, index], "k", lw=1, label="true")
             predicted = out["predicted_dynamics", quantity][1:, index]
             axis.plot(time[1:], predicted, "tab:green", lw=1, label="predicted")
-            axis.set_title(f"{body} {quantity} {component} [{unit}]", fontsize=8)
+            axis.set_title(f"{body} {quantity} {component}{unit}", fontsize=8)
             axis.tick_params(labelsize=7)
     for axis in axes[-1]:
         axis.set_xlabel("time [s]", fontsize=8)

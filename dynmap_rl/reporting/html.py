@@ -20,7 +20,7 @@ TYPES = {".png": "image/png", ".gif": "image/gif"}
 PICTURES = {  # in this order
     "rollouts.gif": "Rollouts in closed loop, failures first",
     "figures/reconstruction.png": "Held-out frames, and their predictions from the frame before",
-    "figures/dynamics.png": "The block's dynamics along a held-out episode, true and predicted",
+    "figures/dynamics.png": "Dynamics of a body along a held-out episode, true and predicted",
     "open_loop.png": "Error of open-loop predictions against the time without frames",
     "probes.png": "R^2 of linear maps from the states to the dynamics",
     "perception.png": "Held-out demonstrations, and what each world model predicted from the frame before",

@@ -14,6 +14,7 @@ from dynmap_rl.evaluation.errors import known_dynamics
 from dynmap_rl.evaluation.probing import judged_text
 from dynmap_rl.modules.supervision import row_name
 from dynmap_rl.modules.world_model import WorldModel
+from dynmap_rl.objectives.imitation import find_target
 from dynmap_rl.utils.files import write_json
 from dynmap_rl.utils.version import find_commit
 
@@ -127,8 +128,8 @@ def robot_row_text(result: dict) -> str:
 def _values(episodes: TensorDictBase, quantity: str) -> torch.Tensor:
     if quantity != "action":
         return known_dynamics(episodes, quantity)
-    pushed = episodes.get("disturbed", None)
-    return episodes["action"] if pushed is None else episodes["action"].where(~pushed, torch.nan)
+    action, ignore = find_target(episodes)
+    return action if ignore is None else action.where(~ignore, torch.nan)
 
 
 def _change(episodes: TensorDictBase, quantity: str) -> list[float]:

@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 
 from dynmap_rl.data.demonstrations import find_layout, find_meta
 from dynmap_rl.data.format.reading import find_dataset
+from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.evaluation.protocol import result_rows, unpack_rows
 from dynmap_rl.evaluation.statistics import causes_text, shared_interval, summarize, summarize_seeds
 from dynmap_rl.modules.actor import Actor
@@ -150,13 +151,13 @@ def _draw(folder: Path, world_model: WorldModel, episodes: TensorDictBase, resul
     from .figures import plot_dynamics, plot_reconstruction
 
     world_model.cpu()  # as the episodes are
-    layout = find_layout(
-        find_meta(find_dataset(result["trained_on"]["dataset"]))
-    )  # its dynamics may be others
+    # Its dynamics may be others than those of the task.
+    layout = find_layout(find_meta(find_dataset(result["trained_on"]["dataset"])))
     if result["world_model"]["training"] != "end_to_end":  # its decoders are not trained
         path = folder / "figures" / "reconstruction.png"
         plot_reconstruction(world_model, episodes[:3], path, dt=layout.dt)
-    plot_dynamics(world_model, episodes[0], folder / "figures" / "dynamics.png", layout)
+    own = layout == get_task(result["task"]).layout  # others may be in pixels
+    plot_dynamics(world_model, episodes[0], folder / "figures" / "dynamics.png", layout, units=own)
     policy = load_policy(folder / f"seed_{result['seeds'][0]}" / "policy")
     actor, rows = Actor(world_model, policy, mixed=True), result["results"][0]["test"]["rows"]
     film_policy(actor, result["task"], rows, folder / "rollouts.gif")

@@ -76,8 +76,11 @@ def parse_settings(config_class: type, arguments: Sequence[str]):
     import mergedeep
     import yaml
 
+    read = draccus.parsers.decoding.decode_from_init
+    # Shells leave --output=~/x as it is.
+    draccus.decode.register(Path, lambda value, path: read(Path, value, path).expanduser())
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--config_path", type=Path)
+    parser.add_argument("--config_path", type=lambda text: Path(text).expanduser())
     file, arguments = parser.parse_known_args(arguments)
     settings = draccus.encode(config_class())
     if file.config_path:

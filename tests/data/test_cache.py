@@ -121,3 +121,11 @@ def test_splits_in_any_order(copy):
     splits, _ = load_demonstrations(copy)
     assert (splits["train"] == expected[3:]).all() and (splits["eval"] == expected[1:3]).all()
     assert (load_dataset(copy) == expected).all() and (load_dataset(copy, "eval") == expected[1:3]).all()
+
+
+def test_the_hubs_snapshots_share_a_cache_beside_them(copy, tmp_path, decoded):
+    place = tmp_path / "datasets--me--mine/snapshots/0123abcd"
+    shutil.copytree(copy, place)
+    load_dataset(place)
+    assert [path.name for path in place.parent.iterdir()] == ["0123abcd"]
+    assert (tmp_path / "datasets--me--mine/dynmap_rl.cache").is_dir()

@@ -56,7 +56,7 @@ def test_an_axis_has_one_angle_in_all_episodes(degrees):
     true = np.concatenate([np.radians(start) + turn for start in degrees])
     starts, rows = np.radians(degrees), [slice(20 * i, 20 * i + 20) for i in range(4)]
     measured = np.concatenate([s - np.pi * np.round(s / np.pi) + turn for s in starts])[:, None]
-    tracks = Tracks(None, None, None, None, None, np.array([2.0]), 0.1)
+    tracks = Tracks(None, None, None, None, None, np.array([2.0]), None, 0.1)
     motion = Motion(None, [0], found=np.ones((20, 1), bool), tracks=tracks)
     align_axes(measured, [(own, motion) for own in rows])
     offset = (measured[:, 0] - true) / np.pi

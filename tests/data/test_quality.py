@@ -66,6 +66,24 @@ def test_a_fault_of_a_film_is_found_with_its_place(fault):
         assert quality["checks"]["lost"]["where"] == "high"
 
 
+def judge_order(films):
+    parts = []
+    for episode, frames in enumerate(films):
+        motion = measure(frames, (1, 1), FrameSource("tracks", "front", 2), 20)
+        velocity, _ = differentiate(motion.position, np.arange(len(frames)) / 20, "savgol")
+        parts.append(Derived(episode, NAMES, motion.position, velocity, motion.light()))
+    return judge_quality(parts)["checks"]["order"]
+
+
+def test_objects_that_change_places_between_episodes_are_found():
+    films = [film(POSES[:, ::-1] if episode in (1, 4) else POSES) for episode in range(6)]
+    check = judge_order(films)
+    assert not check["good"] and check["value"] == pytest.approx(1 / 3) and check["episode"] in (1, 4)
+    rng = np.random.default_rng(0)
+    colors = [[tuple(map(int, color)) for color in rng.integers(0, 140, (2, 3))] for _ in range(6)]
+    assert judge_order([film(POSES, colors=some) for some in colors])["good"], "scenes of many colours"
+
+
 def judge_state(position):
     velocity, _ = differentiate(position, np.arange(len(position)) / 20)
     return judge_quality([Derived(0, NAMES, position, velocity, Motion(position, [2, 5]))])["checks"]

@@ -15,6 +15,7 @@ from dynmap_rl.data.format.frames import join_views
 from dynmap_rl.data.format.images import decode_image
 from dynmap_rl.data.robot import describe_robot_dataset, load_robot_dataset
 from dynmap_rl.data.windows import sample_windows
+from dynmap_rl.objectives.imitation import find_target
 
 LENGTHS = (31, 47, 24, 33)
 
@@ -227,3 +228,10 @@ def test_a_damaged_video_is_named(folders, tmp_path):
     path.write_bytes(path.read_bytes()[:500])
     with pytest.raises(ValueError, match=f"{path} cannot be decoded"):
         load_robot_dataset(root, 20)
+
+
+def test_the_expert_s_action_is_to_be_imitated(recording):
+    """A recording of a task may be loaded as that of a robot; its actions are noisy."""
+    episodes = torch.cat(list(load_robot_dataset(recording, 20)[0].values()))
+    assert not torch.equal(episodes["action"], episodes["expert_action"])
+    torch.testing.assert_close(find_target(episodes)[0], episodes["expert_action"])

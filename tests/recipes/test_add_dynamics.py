@@ -250,7 +250,7 @@ def test_a_killed_run_leaves_nothing_that_looks_done(images, tmp_path):
     code = f"{kill} import runpy, sys; sys.argv[1:] = {list(arguments)}; runpy.run_path({str(RECIPE)!r}, run_name='__main__')"
     killed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=os.environ)
     assert killed.returncode == 9, killed.stderr
-    assert [path.name for path in tmp_path.iterdir()] == ["output.tmp"]
+    assert [path.name for path in tmp_path.iterdir()] == [".output.add_dynamics"]
     main(Config(dataset=str(images[0]), output=output))
     assert [path.name for path in tmp_path.iterdir()] == ["output"]
 
@@ -298,10 +298,40 @@ def test_entries_of_an_object_that_is_hidden_are_not_labels(monkeypatch, tmp_pat
 
 def test_trainings_of_the_tasks_leave_out_what_was_not_found(recording, tmp_path):
     add_dynamics(recording, tmp_path / "tracked", source="tracks", replace=True)
+    for path in (tmp_path / "tracked/data").rglob("*.parquet"):
+        table = pq.read_table(path)
+        found = np.array(table["dynamics.found"].to_pylist())
+        found[::7, 3:] = False
+        place = table.column_names.index("dynamics.found")
+        column = pa.FixedSizeListArray.from_arrays(pa.array(found.ravel()), 6)
+        pq.write_table(table.set_column(place, "dynamics.found", column), path)
+    found = read(tmp_path / "tracked", "dynamics.found")
+    assert not found.all()
     episodes = load_dataset(tmp_path / "tracked")
-    assert np.array_equal(
-        episodes["labelled"].flatten(0, 1).numpy(), read(tmp_path / "tracked", "dynamics.found")
-    )
+    assert np.array_equal(episodes["labelled"].flatten(0, 1).numpy(), found)
+    splits, _ = load_demonstrations(tmp_path / "tracked")
+    labelled = torch.cat([splits[name]["labelled"] for name in ("train", "eval")])
+    assert np.array_equal(labelled.flatten(0, 1).numpy(), found)
+
+
+def test_tracks_are_cart_and_block_in_their_order_alone(recording, tmp_path):
+    output = tmp_path / "tracked"
+    add_dynamics(recording, output, source="tracks", sort="largest", replace=True)
+    info = json.loads((output / "meta/info.json").read_text())
+    assert info["features"]["dynamics.position"]["names"][0] == "object1_x"
+
+
+def test_the_picture_of_a_recording_is_a_metre_wide(recording, tmp_path):
+    with pytest.raises(ValueError, match="--width must be 1"):
+        add_dynamics(recording, tmp_path / "tracked", source="tracks", replace=True, width=2.0)
+
+
+def test_files_beside_the_output_stay(images, tmp_path):
+    other = tmp_path / "output.tmp"
+    other.mkdir()
+    (other / "thesis.tex").touch()
+    main(Config(dataset=str(images[0]), output=tmp_path / "output"))
+    assert (other / "thesis.tex").exists()
 
 
 @pytest.mark.parametrize(

@@ -36,3 +36,10 @@ def test_another_recording_is_refused(recording, tmp_path):
     result = run(tmp_path, "collect", "--output", recording)
     assert result.returncode == 2 and result.stderr.count("\n") == 1
     assert "another recording (episodes 4 instead of 300" in result.stderr
+
+
+def test_what_cannot_be_uploaded_is_not_recorded(tmp_path):
+    pytest.importorskip("metaworld")
+    result = run(tmp_path, "collect", "--task", "mujoco:PlateSlide", "--push_to_hub", "me/plates")
+    assert result.returncode == 2 and "--push_to_hub" in result.stderr
+    assert not any(tmp_path.iterdir())

@@ -2,6 +2,8 @@
 
 import shutil
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from commands import run
 
@@ -104,5 +106,10 @@ def test_a_dataset_of_another_task_is_refused(trained, recordings, tmp_path):
 
 def test_tracks_with_gaps_are_no_truth(trained, recording, tmp_path):
     add_dynamics(recording, tmp_path / "tracks", source="tracks", replace=True)
+    for path in (tmp_path / "tracks/data").rglob("*.parquet"):
+        table = pq.read_table(path)
+        place = table.column_names.index("dynamics.found")
+        nothing = pa.array([[False] * 6] * len(table), table.schema.field(place).type)
+        pq.write_table(table.set_column(place, "dynamics.found", nothing), path)
     result = run(tmp_path, "probe", "--runs", trained / "none", "--dataset", "tracks")
     assert result.returncode == 2 and "must have the dynamics of every frame" in result.stderr

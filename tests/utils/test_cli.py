@@ -55,9 +55,10 @@ def test_options_with_hyphens_and_bare_flags(run, arguments):
 @pytest.mark.parametrize(
     "text", ["#1c1c1c", "2026-01-01", "yes", "0x1f", "a: b", "[1]", "~", 'it\'s "Ä"', "-1", ""]
 )
-def test_texts_and_paths_are_taken_as_they_are(run, text):
-    assert run("--color", text, "--output", text) == Settings(color=text, output=Path(text))
-    assert run(f"--color={text}", f"--output={text}") == Settings(color=text, output=Path(text))
+def test_texts_are_taken_as_they_are_and_paths_but_for_the_home_folder(run, text):
+    expected = Settings(color=text, output=Path(text).expanduser())
+    assert run("--color", text, "--output", text) == expected
+    assert run(f"--color={text}", f"--output={text}") == expected
 
 
 def test_null_clears_an_option(run, tmp_path):

@@ -45,7 +45,8 @@ def write_columns(
         ValueError: a file of the dataset is damaged.
         OSError: the folder cannot be written.
     """
-    temporary, replaced = output.with_name(f"{output.name}.tmp"), replaced or {}
+    # One name, so that the next command deletes what a killed one has left.
+    temporary, replaced = output.with_name(f".{output.name}.add_dynamics"), replaced or {}
     stats = read_json(path) if (path := root / "meta" / "stats.json").exists() else {}
     try:
         shutil.rmtree(temporary, ignore_errors=True)

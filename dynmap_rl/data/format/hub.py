@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 from tensordict import TensorDict
 
+from dynmap_rl.envs.task import LAYOUT
+from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.world import CONTROL_DT, EPISODE_STEPS
 from dynmap_rl.utils.files import read_json
 from dynmap_rl.utils.hub import first_line
@@ -61,6 +63,15 @@ CONTENTS = {
 DERIVATION = """\
 The dynamics were derived with `python recipes/add_dynamics.py --source {source}`, and are judged {verdict}. All options and
 checks are in `meta/dynamics.json`."""
+
+
+def check_uploadable(task: str) -> None:
+    """Raise ``ValueError`` for a task whose recordings :func:`push_dataset` refuses."""
+    if get_task(task).layout != LAYOUT:
+        raise ValueError(
+            f"--push_to_hub needs a task of cart and block, whose card is written here, got {task}; upload the recording "
+            "with LeRobotDataset.push_to_hub"
+        )
 
 
 def push_dataset(root: str | Path, repo_id: str) -> None:
