@@ -160,6 +160,7 @@ def benchmark_rows(results: Path) -> list[dict]:
         if len({tuple(row["scene_seed"] for row in part) for part in rows}) > 1:
             raise ValueError(f"{results} must have the same scenes for all seeds of {method} on {task}")
         summary = summarize([row for part in rows for row in part])
+        errors = [] if method in DERIVED else _localization(cells)  # of other entries, or in pixels
         table.append(
             {
                 "task": task,
@@ -168,7 +169,7 @@ def benchmark_rows(results: Path) -> list[dict]:
                 **{name: summary[name] for name in ("episodes", "SR", "DR", "PE")},
                 "SR_interval": shared_interval(rows),
                 "DR_interval": shared_interval(rows, "dropped"),
-                "localization": fmean(errors) if (errors := _localization(cells)) else None,
+                "localization": fmean(errors) if errors else None,
                 "rates": [summarize(part)["SR"] for part in rows],
                 "causes": summary.get("causes", {}),
                 "commands": [cell["command"] for cell in cells],

@@ -80,7 +80,7 @@ def write_report(
         **_paper_protocol(results),
         "test_protocol": summarize([row for rows in test for row in rows])
         | {"SR_interval": shared_interval(test), "DR_interval": shared_interval(test, "dropped")}
-        | _localization(results),
+        | (_localization(results) if _has_entries_of_its_task(dataset, task) else {}),
         "settings": settings,
         "command": command,
         "commit": find_commit(),
@@ -138,6 +138,11 @@ def _paper_protocol(results: list[dict]) -> dict:
     return {"paper_protocol": summarize_seeds([unpack_rows(r["paper"]["rows"]) for r in results])}
 
 
+def _has_entries_of_its_task(dataset: str | Path, task: str) -> bool:
+    """Return whether the positions of a dataset are those that the task measures; tracks may be of others, in pixels."""
+    return find_layout(find_meta(find_dataset(dataset))).position == get_task(task).layout.position
+
+
 def _localization(results: list[dict]) -> dict[str, float]:
     """Return the mean over the seeds of the world model's errors in the cart's position (mm)."""
     summaries = [result["test"]["summary"] for result in results]
@@ -151,13 +156,15 @@ def _draw(folder: Path, world_model: WorldModel, episodes: TensorDictBase, resul
     from .figures import plot_dynamics, plot_reconstruction
 
     world_model.cpu()  # as the episodes are
-    # Its dynamics may be others than those of the task.
-    layout = find_layout(find_meta(find_dataset(result["trained_on"]["dataset"])))
+    dataset = result["trained_on"]["dataset"]
+    layout, units = (
+        find_layout(find_meta(find_dataset(dataset))),
+        _has_entries_of_its_task(dataset, result["task"]),
+    )
     if result["world_model"]["training"] != "end_to_end":  # its decoders are not trained
         path = folder / "figures" / "reconstruction.png"
         plot_reconstruction(world_model, episodes[:3], path, dt=layout.dt)
-    own = layout == get_task(result["task"]).layout  # others may be in pixels
-    plot_dynamics(world_model, episodes[0], folder / "figures" / "dynamics.png", layout, units=own)
+    plot_dynamics(world_model, episodes[0], folder / "figures" / "dynamics.png", layout, units=units)
     policy = load_policy(folder / f"seed_{result['seeds'][0]}" / "policy")
     actor, rows = Actor(world_model, policy, mixed=True), result["results"][0]["test"]["rows"]
     film_policy(actor, result["task"], rows, folder / "rollouts.gif")
