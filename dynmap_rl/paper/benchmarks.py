@@ -9,7 +9,7 @@ from statistics import fmean
 
 from dynmap_rl.data.derive import add_dynamics
 from dynmap_rl.evaluation.protocol import result_rows
-from dynmap_rl.evaluation.statistics import shared_interval, summarize
+from dynmap_rl.evaluation.statistics import shared_interval, summarize, welch_interval
 from dynmap_rl.utils.files import read_json
 
 from .cells import Run
@@ -36,6 +36,17 @@ METHODS = {  # by the row of the table: recipe and its options
     "ACT": ("baseline", ("--policy", "act")),
     "Diffusion Policy": ("baseline", ("--policy", "diffusion")),
 }
+GAPS = (  # of which the page gives intervals
+    ("RGB+[P]", "Only-RGB"),
+    ("RGB+[P+V]", "Only-RGB"),
+    ("RGB+[P+V]", "RGB+[P]"),
+    ("RGB+[P+V]", "RGB+[P+V], hand and color"),
+    ("RGB+[P+V], hand and color", "Only-RGB"),
+    ("RGB+[P+V]", "End-to-End"),
+    ("RGB+[P+V]", "ACT"),
+    ("End-to-End", "ACT"),
+    ("ACT", "Diffusion Policy"),
+)
 UPDATES = {  # of world models and policies, in the place of the defaults; chosen on validation scenes
     "FetchPush": ("--policy.updates", "4000"),
     "FetchSlide": ("--policy.updates", "4000"),
@@ -52,6 +63,10 @@ Diffusion Policy are the recipes' defaults. Derived dynamics (of the hand, track
 `python recipes/paper/benchmarks3d.py --write` from the files in this folder.
 
 {table}
+
+Differences over trainings, with 95 % intervals by Welch's t, of at least two seeds a side:
+
+{gaps}
 
 Runs by commit: {commits}. A run that was resumed names the commit at its end.{devices}
 
@@ -206,6 +221,20 @@ def benchmark_table(rows: list[dict], experts: dict[str, dict] | None = None) ->
     return join_table(["success %", *TASKS], lines)
 
 
+def gap_table(rows: list[dict]) -> str:
+    """Return a table of the differences of methods in SR, in points, with intervals over trainings."""
+    rates, lines = {(row["task"], row["method"]): row["rates"] for row in rows}, []
+    for method, other in GAPS:
+        line = [f"{method} - {other}"]
+        for task in TASKS:
+            ours, theirs = rates.get((task, method), []), rates.get((task, other), [])
+            interval = welch_interval(ours, theirs)
+            gap = fmean(ours) - fmean(theirs) if interval else 0.0
+            line.append("{:+.1f} [{:+.1f}, {:+.1f}]".format(gap, *interval) if interval else "")
+        lines.append(line)
+    return join_table(["points of SR", *TASKS], lines)
+
+
 def benchmark_page(rows: list[dict], folder: Path) -> str:
     """Return the page of the results in Markdown, with the animations that are in the folder."""
     titles = [f"{row['task']}: {row['method']}" for row in rows]
@@ -226,6 +255,7 @@ def benchmark_page(rows: list[dict], folder: Path) -> str:
         table=benchmark_table(rows, experts),
         commits=commits_text(Counter(commit for row in rows for commit in row["commits"])),
         devices=devices_text(sum((Counter(row["devices"]) for row in rows), Counter())),
+        gaps=gap_table(rows),
         failures=cause_table(
             (t, row["episodes"], row["causes"]) for t, row in zip(titles, rows, strict=True)
         ),

@@ -6,6 +6,7 @@ from own_task import check_renderer
 
 from dynmap_rl.data import load_dataset, record_dataset
 from dynmap_rl.evaluation.protocol import pack_rows
+from dynmap_rl.evaluation.statistics import welch_interval
 from dynmap_rl.paper.benchmarks import (
     COLORS,
     METHODS,
@@ -15,6 +16,7 @@ from dynmap_rl.paper.benchmarks import (
     benchmark_rows,
     benchmark_table,
     derive_dataset,
+    gap_table,
     list_benchmarks,
 )
 from dynmap_rl.utils.cli import parse_settings, read_arguments
@@ -73,6 +75,21 @@ def test_the_table_has_what_the_results_have(tmp_path):
     write_json(tmp_path / f"{cells['Soccer', 'RGB+[P]', 2].name}.json", make_result([1, 1, 1, 1], first=9))
     with pytest.raises(ValueError, match="same scenes"):
         benchmark_rows(tmp_path)
+
+
+def test_gaps_are_over_trainings(tmp_path):
+    cells = list_benchmarks()
+    for method, successes in (
+        ("RGB+[P]", ([1, 1, 0, 1], [1, 0, 0, 1])),
+        ("Only-RGB", ([0, 0, 0, 0], [1, 0, 0, 0])),
+    ):
+        for seed, success in enumerate(successes):
+            write_json(tmp_path / f"{cells['Soccer', method, seed].name}.json", make_result(success))
+    low, high = welch_interval([75, 50], [0, 25])
+    lines = gap_table(benchmark_rows(tmp_path)).splitlines()
+    [line] = [line for line in lines if line.startswith("| RGB+[P] - Only-RGB |")]
+    assert line.endswith(f"| +50.0 [{low:+.1f}, {high:+.1f}] |")
+    assert sum("[+" in line or "[-" in line for line in lines) == 1, "others have too few seeds"
 
 
 def test_a_page_without_failures_or_commits(tmp_path):
