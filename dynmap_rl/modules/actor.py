@@ -209,7 +209,7 @@ class Actor(TensorDictModuleBase):
         pixels = tensordict.get(self.pixels, None)
         if pixels is None:
             predicted = tensordict.get(self.predicted_latent, None)
-            check_frame(self, predicted is not None)
+            check_frame(self.pixels, predicted is not None)
             return tensordict.set(self.latent, predicted)
         return tensordict.set(self.latent, self.world_model.encode(pixels, self.mixed))
 

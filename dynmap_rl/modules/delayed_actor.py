@@ -148,7 +148,7 @@ class DelayedActor(TensorDictModuleBase):
         """Encode the frames that arrive and put each where it belongs."""
         pixels, step = tensordict.get(self.actor.pixels, None), history["step"]
         if pixels is None:
-            check_frame(self.actor, bool(step.any()))
+            check_frame(self.actor.pixels, bool(step.any()))
             return
         delay = tensordict.get(self.delay_key, step.clamp(max=self.delay))
         if pixels.ndim == tensordict.ndim + 3:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
 
 import torch
 from tensordict import TensorDictBase
@@ -13,9 +12,6 @@ from tensordict.utils import NestedKey, unravel_key
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import TensorDictPrimer
 from torchrl.modules import recurrent_mode
-
-if TYPE_CHECKING:
-    from .actor import Actor
 
 
 def recall(tensordict: TensorDictBase, sizes: dict, is_init: NestedKey, device) -> tuple[torch.Tensor, ...]:
@@ -26,11 +22,11 @@ def recall(tensordict: TensorDictBase, sizes: dict, is_init: NestedKey, device) 
     return state if begins is None else tuple(s.masked_fill(begins, 0.0) for s in state)
 
 
-def check_frame(actor: Actor, predicted: bool) -> None:
+def check_frame(pixels: NestedKey, predicted: bool) -> None:
     """Raise ``KeyError`` where there is no predicted latent in the place of a frame."""
     if not predicted:
         raise KeyError(
-            f"there is no frame {actor.pixels!r} and no latent that was predicted before it; environments of this package "
+            f"there is no frame {pixels!r} and no latent that was predicted before it; environments of this package "
             "need from_pixels=True"
         )
 

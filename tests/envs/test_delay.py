@@ -153,6 +153,7 @@ def test_gymnasium_accepts_the_wrapped_tasks(obs_type):
 
 
 @pytest.mark.filterwarnings("ignore:.*is different from the unwrapped version")
+@pytest.mark.filterwarnings("ignore:.*A Box observation space")
 def test_a_frame_may_be_a_dict():
     env = gym.make("dynmap_rl/Task-v0", task="balance_reaching", disable_env_checker=True)
     env = DelayFrames(env, FrameDelay(3, 2, 0.2))
