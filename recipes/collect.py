@@ -54,7 +54,7 @@ def main(config: Config) -> None:
     suffix = "" if config.kind == "demonstrations" else f"_{config.kind}"
     output = config.output or Path("datasets") / f"{get_task(config.task).name}{suffix}"
     if config.push_to_hub:
-        check_uploadable(config.task)
+        check_uploadable(config.task, get_task(config.task).layout)
     complete = (output / META).exists()
     sizes = config.episodes, config.eval_episodes
     record_dataset(output, config.task, config.kind, *sizes, config.workers, config.expert, config.launcher)

@@ -91,7 +91,7 @@ def main(config: Config) -> None:
     if config.push_to_hub and not config.record:
         raise ValueError("--push_to_hub needs --record, the folder of the demonstrations")
     if config.push_to_hub:
-        check_uploadable(task)
+        check_uploadable(task, layout)
     kept, first = 0, config.scene
     if config.record:
         open_folder(config.record, task)

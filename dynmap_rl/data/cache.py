@@ -67,10 +67,8 @@ def open_cached(
 
 
 def _find_place(root: Path, cache: Path | None) -> Path:
-    if (
-        cache is None and root.parent.name == "snapshots"
-    ):  # of the hub's cache: one for all snapshots of the repository
-        return root.parents[1] / "dynmap_rl.cache"
+    if cache is None and root.parent.name == "snapshots":  # of the hub's cache
+        return root.parents[1] / "dynmap_rl.cache"  # one for all snapshots, so that old ones are deleted
     if cache is None:
         return root.with_name(f"{root.name}.cache")
     path = hashlib.sha256(str(root).encode()).hexdigest()[:8]  # datasets may have the same name

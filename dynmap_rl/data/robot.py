@@ -105,8 +105,8 @@ def load_robot_dataset(
         every quantity of the dynamics). Pieces are ``[P, T]``: ``pixels`` uint8 ``[P, T, 3, S, cameras * S]``, ``action``
         ``[P, T, A]``, ``goal`` ``[P, T, G]`` (G = 0 without a goal), ``("dynamics", quantity)`` ``[P, T, D]`` for the
         columns that the dataset has, float32 in its units, ``disturbed`` bool ``[P, T, 1]`` where the dataset has such a
-        column of flags, ``expert_action`` ``[P, T, A]``, the action to imitate, likewise, ``labelled`` bool ``[P, T, D]`` likewise (see :func:`dynmap_rl.data.load_dataset`), ``episode`` int64 ``[P, T]``, the
-        episode's index, and ``step_count`` int64 ``[P, T, 1]``, the number of the step in its episode.
+        column of flags, likewise ``expert_action`` ``[P, T, A]``, the action to imitate, and ``labelled`` bool
+        ``[P, T, D]`` (see :func:`dynmap_rl.data.load_dataset`), ``episode`` int64 ``[P, T]``, the episode's index, and ``step_count`` int64 ``[P, T, 1]``, the number of the step in its episode.
 
     Raises:
         ValueError: the dataset is missing or damaged, or fewer than two episodes are long enough.

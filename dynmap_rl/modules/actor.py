@@ -8,7 +8,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequ
 from tensordict.utils import NestedKey, unravel_key
 from torchrl.envs import TensorDictPrimer
 
-from .memory import check_frame, make_primer, recall, remember, warn_without_memory
+from .memory import make_primer, recall, remember, warn_without_memory
 from .policy import FeedforwardPolicy, RecurrentPolicy
 from .world_model import WorldModel
 
@@ -123,7 +123,7 @@ class LatentActor(TensorDictModuleBase):
             sizes = dict.fromkeys(keys, self.policy.lstm.hidden_size)
             state = recall(tensordict, sizes, self.is_init, latent.device)
         action, state = self.policy.step(latent, hidden1, hidden2, tensordict[self.goal], state)
-        if state and not keys:
+        if state is not None and not keys:
             raise TypeError(
                 f"a policy with memory must be a RecurrentPolicy, got {type(self.policy).__name__}"
             )
@@ -235,3 +235,12 @@ class Actor(TensorDictModuleBase):
         if self.latent_actor.policy_memory:
             sizes |= dict.fromkeys(self.latent_actor.policy_memory, self.policy.lstm.hidden_size)
         return make_primer(sizes)
+
+
+def check_frame(pixels: NestedKey, predicted: bool) -> None:
+    """Raise ``KeyError`` where there is no predicted latent in the place of a frame."""
+    if not predicted:
+        raise KeyError(
+            f"there is no frame {pixels!r} and no latent that was predicted before it; environments of this package "
+            "need from_pixels=True"
+        )

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import torch
 
+from dynmap_rl.keys import DYNAMICS
 from dynmap_rl.utils.files import read_json, write_json
 from dynmap_rl.utils.weights import load_module, save_weights
 
@@ -42,10 +43,9 @@ def make_world_model(
     Raises:
         ValueError: a quantity has no constants.
     """
-    if isinstance(supervision, str) or not set(supervision) <= set(constants):
-        raise ValueError(
-            f"supervision must be a sequence of {', '.join(constants.keys() - {'action', 'goal'})}, got {supervision!r}"
-        )
+    known = [quantity for quantity in DYNAMICS if quantity in constants]
+    if isinstance(supervision, str) or not set(supervision) <= set(known):
+        raise ValueError(f"supervision must be a sequence of {', '.join(known)}, got {supervision!r}")
     dynamics = {q: Normalizer(**constants[q]) for q in supervision}
     sizes = latent_size, hidden_size, architecture, image_size, cameras
     return WorldModel(Normalizer(**constants["action"]), dynamics, *sizes)

@@ -11,8 +11,8 @@ from tensordict.utils import NestedKey, unravel_key
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import TensorDictPrimer
 
-from .actor import MEMORY, Actor
-from .memory import check_frame, check_memory, remember, warn_without_memory
+from .actor import MEMORY, Actor, check_frame
+from .memory import check_memory, remember, warn_without_memory
 from .world_model import WorldModel
 
 BASE = ("predicted_latent", *MEMORY)  # state of the world model before the oldest step that is remembered
@@ -32,9 +32,9 @@ class DelayedActor(TensorDictModuleBase):
     ``[..., 1]``: the number of steps since the frame in ``pixels`` was taken. Several frames that arrive in the same
     step have one more axis, ``pixels`` ``[..., M, 3, S, cameras * S]`` and ``delay`` ``[..., M]``, in any order. A negative delay
     marks a place without a frame, and frames from before the episode are not used. Of several frames of one step, the last
-    is used. :class:`dynmap_rl.envs.DelayTransform` writes both entries. Without ``delay`` in the TensorDict, every frame is as old
-    as the argument ``delay``, or the first one of the episode. Without ``pixels``, no frame has arrived, which the first
-    step of an episode does not allow.
+    is used. :class:`dynmap_rl.envs.DelayTransform` writes both entries. Without ``delay`` in the TensorDict, every frame is
+    as old as the argument ``delay``, or the first one of the episode. Without ``pixels``, no frame has arrived; an episode
+    must begin with one.
 
     A call is :meth:`observe`, :meth:`act` and :meth:`predict`, as that of :class:`Actor`. In ``env.rollout`` or a
     collector, append :meth:`make_tensordict_primer` and ``InitTracker`` to the environment.

@@ -22,15 +22,6 @@ def recall(tensordict: TensorDictBase, sizes: dict, is_init: NestedKey, device) 
     return state if begins is None else tuple(s.masked_fill(begins, 0.0) for s in state)
 
 
-def check_frame(pixels: NestedKey, predicted: bool) -> None:
-    """Raise ``KeyError`` where there is no predicted latent in the place of a frame."""
-    if not predicted:
-        raise KeyError(
-            f"there is no frame {pixels!r} and no latent that was predicted before it; environments of this package "
-            "need from_pixels=True"
-        )
-
-
 def check_memory(tensordict: TensorDictBase, keys: Iterable[NestedKey], begins: torch.Tensor | None) -> None:
     """Check that memory is there, except where episodes begin, and that the call is of one time step.
 

@@ -9,12 +9,12 @@ from statistics import fmean
 
 from dynmap_rl.data.derive import add_dynamics
 from dynmap_rl.evaluation.protocol import result_rows
-from dynmap_rl.evaluation.statistics import shared_interval, summarize, welch_interval
+from dynmap_rl.evaluation.statistics import shared_interval, summarize
 from dynmap_rl.utils.files import read_json
 
 from .cells import Run
 from .results import count_devices
-from .tables import cause_table, commits_text, devices_text, join_table
+from .tables import cause_table, commits_text, devices_text, gap_text, join_table
 
 TASKS = "FetchPush", "FetchSlide", "PlateSlide", "Soccer"
 SEEDS = 0, 1, 2  # of weights and batches, of world models and policies
@@ -64,7 +64,7 @@ Diffusion Policy are the recipes' defaults. Derived dynamics (of the hand, track
 
 {table}
 
-Differences over trainings, with 95 % intervals by Welch's t, of at least two seeds a side:
+Differences of the means, with 95 % intervals over trainings (Welch's t) where both sides have several:
 
 {gaps}
 
@@ -227,10 +227,7 @@ def gap_table(rows: list[dict]) -> str:
     for method, other in GAPS:
         line = [f"{method} - {other}"]
         for task in TASKS:
-            ours, theirs = rates.get((task, method), []), rates.get((task, other), [])
-            interval = welch_interval(ours, theirs)
-            gap = fmean(ours) - fmean(theirs) if interval else 0.0
-            line.append("{:+.1f} [{:+.1f}, {:+.1f}]".format(gap, *interval) if interval else "")
+            line.append(gap_text(rates.get((task, method)), rates.get((task, other))))
         lines.append(line)
     return join_table(["points of SR", *TASKS], lines)
 

@@ -11,13 +11,13 @@ from tensordict import TensorDictBase
 
 from dynmap_rl.evaluation.probing import judge_states, probe
 from dynmap_rl.evaluation.protocol import result_rows
-from dynmap_rl.evaluation.statistics import shared_interval, summarize, welch_interval
+from dynmap_rl.evaluation.statistics import shared_interval, summarize
 from dynmap_rl.modules.world_model import WorldModel
 from dynmap_rl.reporting.figures import plt, save_figure
 from dynmap_rl.utils.files import read_json
 
 from .sources import DATA_ROWS, POLICIES, SIZES, SOURCES, WORLD_MODELS, dataset_folder, name_run
-from .tables import join_table
+from .tables import gap_text, join_table
 
 CONTEXT, HORIZON = 20, 40  # steps with frames, and then without
 FEWEST = 5  # sources of a rank correlation
@@ -156,12 +156,8 @@ def gap_table(results: Path, task: str) -> str:
         gaps = []
         for policy in POLICIES:
             cell, full = (read_source(results, task, s, policy) for s in (name, "simulator"))
-            if not (cell and full and name != "simulator"):
-                gaps.append("")
-                continue
-            interval = welch_interval(cell["world_models"], full["world_models"])
-            gap = f"{float(np.mean(cell['world_models']) - np.mean(full['world_models'])):+.1f}"
-            gaps.append(f"{gap} [{interval[0]:+.1f}, {interval[1]:+.1f}]" if interval else gap)
+            both = cell and full and name != "simulator"
+            gaps.append(gap_text(cell["world_models"], full["world_models"]) if both else "")
         if any(gaps):
             lines.append([source.text, *gaps])
     return join_table(["points of SR more than with the simulator's dynamics", *POLICIES], lines)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from statistics import fmean
 
 from dynmap_rl.evaluation.failures import CAUSES
-from dynmap_rl.evaluation.statistics import outcome_gap, summarize
+from dynmap_rl.evaluation.statistics import outcome_gap, summarize, welch_interval
 
 from .cells import TASKS, Key
 from .published import METRICS, TABLES
@@ -208,6 +209,14 @@ def cause_table(rows: Iterable[tuple[str, int, Mapping[str, int]]]) -> str:
         for title, episodes, counts in rows
     ]
     return join_table(["% of the episodes", "fail", *causes], lines)
+
+
+def gap_text(ours: Sequence[float] | None, theirs: Sequence[float] | None) -> str:
+    """Return the difference of two means of rates (%), with its interval where there is one; empty without rates."""
+    if not (ours and theirs):
+        return ""
+    gap, interval = f"{fmean(ours) - fmean(theirs):+.1f}", welch_interval(ours, theirs)
+    return f"{gap} [{interval[0]:+.1f}, {interval[1]:+.1f}]" if interval else gap
 
 
 def commits_text(commits: Counter[str]) -> str:

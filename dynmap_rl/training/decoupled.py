@@ -39,9 +39,7 @@ from .dataset import choose_augmentation
 from .policy import train_policy
 from .settings import PolicyTraining
 
-TRAINED = (
-    "trained.json"  # written after a policy's training, with the world model's fingerprint and the settings
-)
+TRAINED = "trained.json"  # fingerprint of the world model, and settings; written after a policy's training
 Judge = Callable[[WorldModel, nn.Module], dict]
 
 

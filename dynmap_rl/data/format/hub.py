@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 from tensordict import TensorDict
 
+from dynmap_rl.envs.protocol import Layout
 from dynmap_rl.envs.task import LAYOUT
-from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.world import CONTROL_DT, EPISODE_STEPS
 from dynmap_rl.utils.files import read_json
 from dynmap_rl.utils.hub import first_line
 
-from ..demonstrations import DERIVED, META, load_dataset, load_meta
+from ..demonstrations import DERIVED, META, find_layout, load_dataset, load_meta
 from .quiet import quiet
 
 PICTURE = "picture.png"
@@ -65,12 +65,12 @@ The dynamics were derived with `python recipes/add_dynamics.py --source {source}
 checks are in `meta/dynamics.json`."""
 
 
-def check_uploadable(task: str) -> None:
-    """Raise ``ValueError`` for a task whose recordings :func:`push_dataset` refuses."""
-    if get_task(task).layout != LAYOUT:
+def check_uploadable(task: str, layout: Layout) -> None:
+    """Raise ``ValueError`` for a recording that :func:`push_dataset` refuses, by its task and layout."""
+    if layout != LAYOUT:
         raise ValueError(
-            f"--push_to_hub needs a task of cart and block, whose card is written here, got {task}; upload the recording "
-            "with LeRobotDataset.push_to_hub"
+            f"--push_to_hub needs a recording of cart and block, whose card is written here, got {task}; upload it with "
+            "LeRobotDataset.push_to_hub"
         )
 
 
@@ -89,11 +89,7 @@ def push_dataset(root: str | Path, repo_id: str) -> None:
         OSError: the hub refuses the upload or cannot be reached.
     """
     meta = load_meta(root)
-    if "layout" in meta:
-        raise ValueError(
-            f"{root} must be a recording of cart and block, whose card is written here, got {meta['task']}; upload it "
-            "with LeRobotDataset.push_to_hub"
-        )
+    check_uploadable(meta["task"], find_layout(meta))
     derived = read_json(path) if (path := Path(root) / DERIVED).exists() else None
     with quiet():
         from huggingface_hub import HfApi
