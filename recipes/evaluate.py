@@ -1,7 +1,7 @@
 """Evaluate a policy or an expert on a task's test scenes.
 
     python recipes/evaluate.py --policy balance_reaching                             # ships with the package
-    python recipes/evaluate.py --policy runs/decoupled/balance_reaching/position_velocity_recurrent --failures true
+    python recipes/evaluate.py --policy runs/decoupled/balance_reaching/position_velocity_recurrent --failures
     python recipes/evaluate.py --policy runs/act/checkpoints/last/pretrained_model   # any LeRobot policy
     python recipes/evaluate.py --policy balance_reaching --delay 6 --jitter 2 --lost 0.1     # late and lost frames
     python recipes/evaluate.py --expert balance_reaching --task balance_reaching_obstacle

@@ -36,7 +36,7 @@ class Config:
     seed: int = 0
     # Expert: a task whose expert ships, or a folder of checkpoints; by default the task's own.
     expert: str | None = None
-    # Step of every episode from which the world model continues without frames, as if I were pressed.
+    # Step of every episode from which the world model continues without frames, as if the key I were pressed.
     imagine_from: int | None = None
     # Delay of the policy's frames in control steps, at most 20.
     delay: int = 0

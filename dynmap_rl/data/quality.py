@@ -55,7 +55,7 @@ LIMITS = {
     ),
     "residual_angle": (
         0.07, True, "distance of an angle from a smooth trajectory, root mean square (rad)",
-        "film from nearer, or use --point true for tracks without angles: a round object has none; only velocities gain by "
+        "film from nearer, or use --point for tracks without angles: a round object has none; only velocities gain by "
         "--method savgol with a longer --window",
     ),
     "order": (

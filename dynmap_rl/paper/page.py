@@ -250,10 +250,14 @@ def write_results_page(results: Path, readme: Path) -> list[Path]:
 
 
 def _repeated(folder: Path) -> str:
-    names = ", ".join(find_repeated(folder))
+    names = [f"- `{name}`" for name in find_repeated(folder)]
+    if not names:
+        return ""
+    lines = "\n".join(names)
     return (
-        f"On another training of the world model of the run that they name, which was repeated: {names}."
-        * bool(names)
+        f"The world models of {len(names)} runs were trained again later. The policies of these runs are on the earlier "
+        "training, and are not paired with policies on the later one.\n\n"
+        f"<details><summary>Runs on earlier world models</summary>\n\n{lines}\n\n</details>"
     )
 
 

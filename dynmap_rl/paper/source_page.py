@@ -38,7 +38,9 @@ def write_source_page(results: Path, tasks: list[str], architecture: str = "glim
         "differences between trainings; those of the differences from the simulator's dynamics are over world models. "
         "Share of the gain: (SR - SR of Only-RGB) / (SR with the simulator's dynamics - SR "
         "of Only-RGB). Policies of rows with 15 copies are also trained on the states of 15 augmented copies of every "
-        "demonstration. Measures are means over the world models that have been probed. Derived "
+        "demonstration. Measures are means over the world models that have been probed, and so are the rates in the "
+        "figures of measures and in rank correlations: of the simulator and Only-RGB on task 1, one world model. Several sources "
+        "are one recording with different noise, so that p is too small. Derived "
         "columns have the verdict of `add_dynamics.py`, before any training, with the checks that failed. Written by "
         "`recipes/paper/sources.py --write`.",
     ]

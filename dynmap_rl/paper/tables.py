@@ -227,20 +227,19 @@ def commits_text(commits: Counter[str]) -> str:
 def devices_text(devices: Counter[str]) -> str:
     """Return how many results are of each GPU, as a sentence; empty if all are of a CPU."""
     gpus = [f"{count} on one {device}" for device, count in devices.most_common() if device != "cpu"]
-    return f" Of {devices.total()} runs, {' and '.join(gpus)}, the others without a GPU." if gpus else ""
+    others = ", the others without a GPU" if devices["cpu"] else ""
+    return f" Of {devices.total()} runs, {' and '.join(gpus)}{others}." if gpus else ""
 
 
 def _notes(cells: Iterable[Cell]) -> str:
     """Return what is missing of some cells, and how many runs are of which commit where there are several."""
     cells = list(cells)
     missing, runs = sum(cell.missing for cell in cells), sum(len(cell.results) for cell in cells)
-    empty = sum(not cell.results for cell in cells)
-    part = sum(bool(cell.missing and cell.results) for cell in cells)
+    complete = sum(not cell.missing for cell in cells)
     text = f"{len(cells)} cells of {runs} runs."
     if missing:
         text = (
-            f"Of {len(cells)} cells, {empty} have no run yet and {part} have some of their runs: "
-            f"{missing} of {missing + runs} runs are missing."
+            f"{complete} of {len(cells)} cells are complete; {missing} of {missing + runs} runs are missing."
         )
     commits = count_commits(cells)
     if len(commits) > 1:

@@ -17,7 +17,7 @@ class WorldModelArchitecture:
 
     # Dynamics that the world model predicts: any of position,velocity,acceleration, or none (Only-RGB).
     supervision: str = "position,velocity"
-    # glimpse (small images that move with attention maps, read by the encoder and drawn by the decoder), plain
+    # glimpse (attention maps find places, where the encoder reads crops and the decoder draws small images), plain
     # (CNNs), or glimpse with an encoder of torchvision: resnet18, resnet18_imagenet (begins with weights that torchvision
     # downloads) or vit.
     architecture: str = "glimpse"

@@ -67,7 +67,7 @@ def parse_settings(config_class: type, arguments: Sequence[str]):
     """Return the dataclass of settings that options, then a file given by ``--config_path``, then defaults set.
 
     Draccus alone would replace a nested default such as ``PPOTraining(iterations=90)`` by ``PPOTraining()`` as soon as
-    another option of the group is given, and in its help.
+    another option of the group is given, and in its help. ``--help`` begins with the docstring of the class's module.
 
     Raises:
         ValueError: the file is not a YAML file of settings.
@@ -89,9 +89,20 @@ def parse_settings(config_class: type, arguments: Sequence[str]):
         yaml.safe_dump(settings, merged)
         merged.flush()
         options = draccus.argparsing.ArgumentParser(config_class, merged.name, exit_on_error=False)
-        if "--help" in arguments:  # draccus would show the defaults of the nested classes
-            options.parser.set_defaults(**flatten(settings))
+        if "--help" in arguments:
+            _complete_help(options.parser, config_class)
+            options.parser.set_defaults(**flatten(settings))  # draccus would show those of the nested classes
         return options.parse_args(arguments)
+
+
+def _complete_help(parser: argparse.ArgumentParser, config_class: type) -> None:
+    """Describe the recipe and ``--debug``, and hide draccus's options for a file of one group, which are refused."""
+    parser.description = sys.modules[config_class.__module__].__doc__
+    parser.add_argument("--debug", action="store_true", help="Show the traceback of an error.")
+    known = {*list_options(config_class), "--help", "--config_path", "--debug"}
+    for action in (action for group in parser._action_groups for action in group._group_actions):
+        if known.isdisjoint(action.option_strings):
+            action.help = argparse.SUPPRESS
 
 
 def read_settings(path: Path) -> dict:

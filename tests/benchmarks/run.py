@@ -127,7 +127,7 @@ def size_table(sizes: dict) -> str:
             f"| {what} | {disk} | {load} | {rate} | {cold['private_MB']:.0f} / {warm['private_MB']:.0f} |"
         )
     if memory := next((r["warm"].get("windows_per_s_in_memory") for r in sizes["rows"].values()), None):
-        lines.append(f"\nFrom a copy in memory, the smallest one gives {memory:,.0f} windows/s.")
+        lines.append(f"\n350 episodes that are held in memory give {memory:,.0f} windows/s.")
     return "\n".join(lines)
 
 

@@ -1,6 +1,7 @@
 """Recipes as commands: options, nested defaults, and errors in one line."""
 
 import ast
+import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -76,6 +77,18 @@ def test_the_help_shows_the_defaults_that_apply(run, capsys):
     lines = " ".join(capsys.readouterr().out.split())
     assert "--first.rate float Some rate. (default: 0.1)" in lines
     assert "--second.rate float Some rate. (default: 0.5)" in lines
+    assert __doc__ in lines and "--debug" in lines
+
+
+def test_the_help_lists_no_option_that_is_refused(run, capsys):
+    with pytest.raises(SystemExit):
+        run("--help")
+    for option in set(re.findall(r"--[a-z_.]+", capsys.readouterr().out)) - {"--help"}:
+        value = [] if option == "--debug" else [""]
+        try:
+            run(option, *value)
+        except SystemExit:
+            assert "unknown option" not in capsys.readouterr().err
 
 
 def test_a_file_of_settings_and_options_that_override_it(run, tmp_path):
