@@ -66,7 +66,7 @@ def main(config: Config) -> None:
     from dynmap_rl.training.dagger import check_corrections
     from dynmap_rl.training.dataset import check_dataset, choose_augmentation, find_or_record
     from dynmap_rl.training.decoupled import check_copies, check_same, train_policies
-    from dynmap_rl.training.settings import check_windows
+    from dynmap_rl.training.settings import check_window_steps
     from dynmap_rl.training.world_model import build_world_model, train_world_model
     from dynmap_rl.utils.devices import choose_device, seed_everything
     from dynmap_rl.utils.files import read_json
@@ -83,7 +83,7 @@ def main(config: Config) -> None:
     augmentation = choose_augmentation(task, config.world_model.augmentation)
     world_model = load_pretrained(config) if config.pretrained else None
     if world_model is None:
-        check_windows(config.world_model, task.layout.steps, "world_model")
+        check_window_steps(config.world_model, task.layout.steps, "world_model")
     origin = {"task": config.task, "training": "decoupled"}
     name = f"{config.world_model.supervision.replace(',', '_')}_{config.policy.kind}"
     folder = config.run or Path("runs/decoupled") / task.name / name

@@ -62,7 +62,7 @@ def main(config: Config) -> None:
     from dynmap_rl.runs.loggers import check_logger
     from dynmap_rl.training.dataset import check_dataset, choose_augmentation, find_or_record
     from dynmap_rl.training.joint import train_seeds
-    from dynmap_rl.training.settings import check_windows
+    from dynmap_rl.training.settings import check_window_steps
     from dynmap_rl.utils.devices import choose_device
     from dynmap_rl.utils.files import read_json
     from dynmap_rl.utils.ranks import first_rank_first, join_ranks, leave_ranks
@@ -71,7 +71,7 @@ def main(config: Config) -> None:
     task, seeds = get_task(config.task), parse_seeds(config.seeds)
     choose_device(config.compute.device)
     augmentation = choose_augmentation(task, config.training.augmentation, imitated=True)
-    check_windows(config.training, task.layout.steps, "training")
+    check_window_steps(config.training, task.layout.steps, "training")
     check_logger(config.logger)
     if config.dataset:
         check_dataset(config.dataset, config.task)

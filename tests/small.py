@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import time
 from pathlib import Path
 
 import torch
 from tensordict import TensorDict
 
+from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.keys import DYNAMICS
 from dynmap_rl.modules.checkpoints import make_world_model
 from dynmap_rl.training.settings import EndToEndTraining, JointTraining, PolicyTraining, WorldModelTraining
@@ -59,3 +62,11 @@ def judge(world_model, policy) -> dict:
 def read_weights(folder: Path) -> dict[str, bytes]:
     """Return the content of all weights in a folder by their paths."""
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*.safetensors")}
+
+
+def exit_elsewhere(num_envs, own):
+    """Make an environment in the process ``own``, and end any other one."""
+    if os.getpid() != own:
+        os._exit(1)
+    time.sleep(1)  # until the other process has taken its share
+    return DynmapBatchedEnv("balance_reaching", num_envs, control="acceleration")

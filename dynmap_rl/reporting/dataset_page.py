@@ -103,7 +103,9 @@ def _film(root: Path, info: dict, camera: str, path: Path) -> None:
         if len(episodes) == EPISODES:
             break
     steps = max(map(len, episodes))
-    shown = np.arange(0, steps, -(-steps // FRAMES))
+    every = -(-steps // FRAMES)
+    shown = np.arange(0, steps, every)
     frames = np.stack([frames[np.minimum(shown, len(frames) - 1)] for frames in episodes])
     pixels = torch.from_numpy(frames).permute(0, 1, 4, 2, 3)
-    save_gif(pixels, path, columns=len(episodes), scale=max(1, WIDEST // pixels.shape[-1]))
+    scale = max(1, WIDEST // pixels.shape[-1])
+    save_gif(pixels, path, every / info.get("fps", 20), columns=len(episodes), scale=scale)

@@ -14,20 +14,24 @@ from dynmap_rl.data.recording.demonstrators import demonstrate
 from dynmap_rl.envs.delay import FrameDelay
 from dynmap_rl.envs.renderer import Renderer
 from dynmap_rl.envs.task import Task
+from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.evaluation.protocol import unpack_rows
 from dynmap_rl.evaluation.rollout import failures_first, roll_out
 from dynmap_rl.experts.network import ExpertNetwork, play
 
 
-def save_gif(pixels: torch.Tensor, path: Path, columns: int = 4, scale: int = 3) -> None:
-    """Write episodes side by side as one animation of 20 steps a second.
+def save_gif(pixels: torch.Tensor, path: Path, dt: float, columns: int = 4, scale: int = 3) -> None:
+    """Write episodes side by side as one animation, with some 25 frames a second at most.
 
     Args:
         pixels: frames uint8 ``[E, T, 3, H, W]``.
         path: file to write.
+        dt: time between two frames (s).
         columns: episodes in a row.
         scale: pixels of the animation for a pixel of a frame.
     """
+    every = max(1, round(0.04 / dt))  # players slow down films with more frames
+    pixels = pixels[:, (pixels.shape[1] - 1) % every :: every]  # with the last one
     episodes, steps, _, height, width = pixels.shape
     rows = -(-episodes // columns)
     frames = pixels.permute(1, 0, 3, 4, 2).numpy()  # (T, E, H, W, 3)
@@ -38,7 +42,9 @@ def save_gif(pixels: torch.Tensor, path: Path, columns: int = 4, scale: int = 3)
     images = [Image.fromarray(f).convert("P", palette=Image.Palette.ADAPTIVE) for f in grid]  # small: quick
     images = [image.resize(size, Image.Resampling.NEAREST) for image in images]
     path.parent.mkdir(parents=True, exist_ok=True)
-    images[0].save(path, save_all=True, append_images=images[1:], duration=50, loop=0, optimize=True)
+    images[0].save(
+        path, save_all=True, append_images=images[1:], duration=1000 * dt * every, loop=0, optimize=True
+    )
 
 
 def film(
@@ -56,7 +62,7 @@ def film(
     renderer = Renderer()
     steps = play(network, task, scene_seeds, states)
     frames = np.stack([[renderer.draw(world, task) for world in worlds] for worlds in steps], 1)
-    save_gif(torch.from_numpy(frames).permute(0, 1, 4, 2, 3), path)
+    save_gif(torch.from_numpy(frames).permute(0, 1, 4, 2, 3), path, task.layout.dt)
 
 
 def film_demonstrator(task: str, scene_seeds: Sequence[int], path: Path) -> None:
@@ -67,7 +73,7 @@ def film_demonstrator(task: str, scene_seeds: Sequence[int], path: Path) -> None
         scene_seeds: seeds of the scenes, an episode each.
         path: file to write.
     """
-    save_gif(demonstrate(task, scene_seeds)["pixels"], path)
+    save_gif(demonstrate(task, scene_seeds)["pixels"], path, get_task(task).layout.dt)
 
 
 def film_policy(
@@ -91,4 +97,4 @@ def film_policy(
     rows = unpack_rows(rows)
     seeds, success = [row["scene_seed"] for row in rows], [row["success"] for row in rows]
     some = failures_first(seeds, success, alone=failures)
-    save_gif(roll_out(actor, task, some, True, delay)["pixels"], path)
+    save_gif(roll_out(actor, task, some, True, delay)["pixels"], path, get_task(task).layout.dt)

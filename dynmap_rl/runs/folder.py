@@ -17,7 +17,8 @@ from dynmap_rl.utils.ranks import first_rank_first, rank
 from dynmap_rl.utils.settings import flatten
 
 FORMAT = 2  # of config.json; the first release had flat settings
-UNTRAINED = {".lock", "config.json", "dataset.json"}  # files of a run that has failed before its training
+# Files of a run that has failed before its training, of which the second and the third are of a dataset or world model.
+UNTRAINED = ".lock", "dataset.json", "world_model.json", "config.json"
 
 
 def open_run(folder: Path, config, *, ignore: tuple[str, ...] = ()) -> Path:
@@ -47,9 +48,10 @@ def _open(folder: Path, config, ignore: tuple[str, ...]) -> Path:
         lock_folder(folder)
     settings = {"format": FORMAT, **plain_settings(config)}
     path = folder / "config.json"
-    untrained = {file.name for file in folder.iterdir()} <= UNTRAINED
+    untrained = {file.name for file in folder.iterdir()} <= set(UNTRAINED)
     if not path.exists() or (untrained and not rank()):
-        (folder / "dataset.json").unlink(missing_ok=True)
+        for name in UNTRAINED[1:3]:
+            (folder / name).unlink(missing_ok=True)
         write_json(path, settings)
         return folder
     stored = read_json(path)
@@ -57,15 +59,25 @@ def _open(folder: Path, config, ignore: tuple[str, ...]) -> Path:
         raise ValueError(
             f"{folder} holds a run of another release, which cannot resume here; choose another --run"
         )
-    defaults = flatten(plain_settings(type(config)()))  # of settings that are younger than the run
-    flat = (s.items() for s in (defaults | flatten(stored), flatten(settings)))
-    old, new = ({k: v for k, v in s if not {k, k.partition(".")[0]} & set(ignore)} for s in flat)
-    if changed := sorted(k for k in {*old, *new} if old.get(k) != new.get(k)):
-        detail = ", ".join(f"{k}: {old.get(k)} there, {new.get(k)} here" for k in changed)
+    changed = compare_settings(stored, config)
+    if changed := {k: v for k, v in changed.items() if not {k, k.partition(".")[0]} & {*ignore, "format"}}:
+        detail = ", ".join(f"{name}: {old} there, {new} here" for name, (old, new) in changed.items())
         raise ValueError(
             f"{folder} holds a run with other settings ({detail}); choose another --run, or delete the folder"
         )
     return folder
+
+
+def compare_settings(stored: dict, config) -> dict[str, tuple]:
+    """Return the settings that differ, by dotted names, each with its stored and its new value.
+
+    Args:
+        stored: settings of :func:`plain_settings`; those that are younger than the run have their defaults.
+        config: dataclass of settings, all with defaults.
+    """
+    new = flatten(plain_settings(config))
+    old = flatten(plain_settings(type(config)())) | flatten(stored)
+    return {k: (old.get(k), new.get(k)) for k in sorted({*old, *new}) if old.get(k) != new.get(k)}
 
 
 def plain_settings(config) -> dict:
@@ -74,8 +86,10 @@ def plain_settings(config) -> dict:
 
 
 def append_metrics(folder: Path, step: int, **metrics: float) -> None:
-    """Append one line to ``metrics.jsonl``."""
-    line = json.dumps({"step": step, **{name: _to_number(value) for name, value in metrics.items()}})
+    """Append one line to ``metrics.jsonl``, without metrics that are NaN."""
+    numbers = {name: _to_number(value) for name, value in metrics.items()}
+    known = {name: number for name, number in numbers.items() if number == number}  # JSON has no NaN
+    line = json.dumps({"step": step, **known})
     Path(folder).mkdir(parents=True, exist_ok=True)
     with open(Path(folder) / "metrics.jsonl", "a") as file:
         file.write(line + "\n")
@@ -102,6 +116,8 @@ def read_metrics(folder: Path) -> list[dict]:
 
 def truncate_metrics(folder: Path, step: int) -> None:
     """Drop the lines after ``step``, which a killed run wrote after its last training state."""
+    if not (Path(folder) / "metrics.jsonl").exists():  # an empty one would count as begun
+        return
     rows = [row for row in read_metrics(folder) if row["step"] <= step]
     write_bytes(Path(folder) / "metrics.jsonl", "".join(json.dumps(row) + "\n" for row in rows).encode())
 

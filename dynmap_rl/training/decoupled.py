@@ -28,7 +28,7 @@ from dynmap_rl.modules.checkpoints import (
     save_world_model,
 )
 from dynmap_rl.modules.world_model import WorldModel
-from dynmap_rl.runs.folder import plain_settings
+from dynmap_rl.runs.folder import compare_settings, plain_settings
 from dynmap_rl.utils.devices import Compute, choose_device, seed_everything
 from dynmap_rl.utils.files import check_space, read_json, write_json
 from dynmap_rl.utils.processes import run_processes
@@ -75,7 +75,7 @@ def train_policies(
     """Freeze a world model; train and judge a policy for every seed that ``folder`` does not hold yet.
 
     Args:
-        world_model: stays as it is.
+        world_model: frozen, set to evaluation and moved to the device; its weights stay as they are.
         episodes: ``train`` and ``eval``, TensorDicts ``[E, T]``.
         constants: of the dataset's normalisation.
         folder: run folder; gets ``world_model`` and ``seed_N`` with ``policy``, ``metrics.jsonl``, ``eval.json``.
@@ -92,19 +92,20 @@ def train_policies(
         The fingerprint of the frozen world model.
 
     Raises:
-        ValueError: the frozen weights have changed, ``folder`` has policies with other settings, corrections are wanted
-            and there is no expert, or copies and there is no task in the plane.
+        ValueError: the frozen weights have changed, ``folder`` has policies with other settings or on another world
+            model, corrections are wanted and there is no expert, or copies and there is no task in the plane.
         OSError: a process died, or the disk is full.
     """
     settings, compute, folder = settings or PolicyTraining(), compute or Compute(), Path(folder)
     check_corrections(settings, task)
     check_copies(settings, task)
-    wanted = plain_settings(settings)
     for path in (folder / f"seed_{seed}" / TRAINED for seed in seeds):
-        if path.exists() and read_json(path).get("settings", wanted) != wanted:
+        if path.exists() and compare_settings(read_json(path).get("settings", {}), settings):
             raise ValueError(f"{path.parent} holds a policy with other settings; choose another folder")
     world_model.eval().requires_grad_(False)
     frozen = fingerprint(world_model)
+    for path in folder.glob("seed_*/eval.json"):
+        check_same(world_model, read_json(path), path.parent)
     save_world_model(folder / "world_model", world_model)
     if todo := [seed for seed in seeds if not (folder / f"seed_{seed}" / "eval.json").exists()]:
         work = _Work(folder, constants, settings, judge, task, compute.device, logger, frozen)

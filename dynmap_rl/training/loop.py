@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import nn
@@ -16,6 +17,7 @@ from dynmap_rl.data.augmentation import augment
 from dynmap_rl.data.windows import check_length, sample_windows
 from dynmap_rl.modules.precision import mixed_precision
 from dynmap_rl.runs.folder import (
+    compare_settings,
     load_training_state,
     plain_settings,
     save_training_state,
@@ -86,9 +88,12 @@ def fit(
     loss_module = make_loss(own)
     start, first, path = 0, None, folder / "checkpoint" / "world_model.pt"
     # A training may go on for more updates.
-    form = plain_settings(replace(settings, updates=1)) | {"seed": seed}
+    one = replace(settings, updates=1)
+    form = plain_settings(one) | {"seed": seed}
     if state := load_training_state(path):
-        if state.get("form", form) != form or state["update"] > settings.updates:
+        stored = state.get("form", form)
+        other = stored.pop("seed") != form["seed"] or compare_settings(stored, one)
+        if other or state["update"] > settings.updates:
             raise ValueError(f"{folder} holds a training with other settings; choose another folder")
         model.load_state_dict(state["model"])
         optimizer.load_state_dict(state["optimizer"])
@@ -106,7 +111,7 @@ def fit(
         batch, length = windows_at(settings, update)
         windows = sample_windows(episodes, batch, length, generator, part).to(device)
         if own is not generator:
-            own.manual_seed((1000 * seed + update) * ranks() + rank())
+            own.manual_seed(int(np.random.SeedSequence((seed, update, rank())).generate_state(1)[0]))
         windows = augment(windows, own, settings.augmentation)
         with mixed_precision(device):
             losses = loss_module(windows)

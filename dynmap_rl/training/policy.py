@@ -62,7 +62,8 @@ def train_policy(
         norm = step(loss, optimizer)
         count = update + 1
         if count % 100 == 0 or count in (1, settings.updates):
-            first = check_loss(loss.item(), norm, first)
+            # The first loss of a policy that goes on is no measure: it is low, and more states may raise it.
+            first = check_loss(loss.item(), norm, None if done else first)
         if count % 100 == 0 or count == settings.updates:
             with torch.no_grad():
                 validation = plain(held_out)["loss_policy"]

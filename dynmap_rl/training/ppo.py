@@ -136,9 +136,11 @@ def train_ppo(
             if last or (iteration + 1) % settings.checkpoint_every == 0:
                 judged = judge(settings.final_episodes if last else settings.eval_episodes)
                 path = folder / "checkpoint" / f"iteration_{iteration + 1:03d}"
-                save_weights(path.with_suffix(".safetensors"), network)
                 at = {"iteration": iteration + 1, "frames": metrics["frames"], "seconds": round(seconds, 1)}
                 write_json(path.with_suffix(".json"), judged | facts | at)
+                save_weights(
+                    path.with_suffix(".safetensors"), network
+                )  # last: a checkpoint is there if these are
                 rates = f"success {judged['success']:.1%}, drop {judged['drop']:.1%}"
                 progress.write(f"iteration {iteration + 1}: {rates}")
             save_training_state(
@@ -162,17 +164,17 @@ def collect(
     sizes = [len(group) for group in torch.arange(settings.num_envs).tensor_split(count)]
     # Everything random follows from seed, iteration and group, so that a resumed run equals an uninterrupted one.
     draws = np.random.SeedSequence((settings.seed, iteration)).generate_state(count).tolist()
-    work = partial(explore, make_env, pickle.dumps(network), settings.steps)
+    work = partial(explore, pickle.dumps((make_env, network)), settings.steps)
     return torch.cat([pickle.loads(part) for part in share(pool, work, list(zip(sizes, draws, strict=True)))])
 
 
 @torch.no_grad()
-def explore(make_env: Callable[[int], EnvBase], network: bytes, steps: int, group: tuple[int, int]) -> bytes:
+def explore(pickled: bytes, steps: int, group: tuple[int, int]) -> bytes:
     """Roll out a group, its number of worlds and its seed, from new scenes with actions drawn from the network.
 
-    Network and result are pickled: as values of another process, each of their tensors would hold a file open.
+    Environment, network and result are pickled: as values of another process, each of their tensors would hold a file open.
     """
-    (worlds, seed), network = group, pickle.loads(network)
+    (worlds, seed), (make_env, network) = group, pickle.loads(pickled)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # processes share the cores, and a sum's last bit may depend on the threads
     try:

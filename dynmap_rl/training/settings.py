@@ -24,14 +24,12 @@ class WorldModelArchitecture:
 
     def __post_init__(self):
         check_choice(self, "architecture", ("glimpse", "plain", "resnet18", "resnet18_imagenet", "vit"))
-        for name in self.supervision.split(","):
-            if name.strip() not in ("none", *DYNAMICS) or (
-                "none" in self.supervision and "," in self.supervision
-            ):
-                raise ValueError(
-                    f"{type(self).__name__}.supervision must be any of {', '.join(DYNAMICS)} with commas between, or "
-                    f"none, got {self.supervision!r}"
-                )
+        names = [name.strip() for name in self.supervision.split(",")]
+        if names != ["none"] and (len(set(names)) < len(names) or not set(names) <= set(DYNAMICS)):
+            raise ValueError(
+                f"{type(self).__name__}.supervision must be any of {', '.join(DYNAMICS)} with commas between, or "
+                f"none, got {self.supervision!r}"
+            )
 
 
 @dataclass(frozen=True)
@@ -181,7 +179,7 @@ class JointTraining(EndToEndTraining):
         check_at_least(self, 0, "rarity", "beta_z", "beta_dynamics", "beta_joint")
 
 
-def check_windows(settings: WorldModelTraining | EndToEndTraining, steps: int, group: str) -> None:
+def check_window_steps(settings: WorldModelTraining | EndToEndTraining, steps: int, group: str) -> None:
     """Raise ``ValueError`` where windows are longer than episodes of ``steps`` steps; ``group`` is that of the option."""
     if settings.window_steps > steps:
         raise ValueError(
@@ -232,5 +230,5 @@ class PPOTraining:
     def __post_init__(self):
         names = "num_envs", "steps", "iterations", "epochs", "minibatch", "checkpoint_every"
         check_at_least(self, 1, *names, "eval_episodes", "final_episodes")
-        check_at_least(self, 0, "learning_rate", "clip", "entropy")
+        check_at_least(self, 0, "seed", "learning_rate", "clip", "entropy")
         check_share(self, "gamma", "gae_lambda")

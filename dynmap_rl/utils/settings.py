@@ -8,7 +8,7 @@ from collections.abc import Sequence
 def check_at_least(settings, low: float, *names: str) -> None:
     """Raise ``ValueError`` for a field below ``low``."""
     for name in names:
-        if (value := getattr(settings, name)) < low:
+        if not (value := getattr(settings, name)) >= low:  # so that NaN is refused too
             raise ValueError(f"{type(settings).__name__}.{name} must be at least {low}, got {value}")
 
 

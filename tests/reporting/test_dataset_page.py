@@ -31,7 +31,7 @@ def test_a_film_has_few_frames(recording, tmp_path, monkeypatch):
     write_dataset_page(tmp_path, recording, {}, "")
     film = Image.open(tmp_path / "episodes.gif")
     durations = [frame.info["duration"] for frame in ImageSequence.Iterator(film)]
-    assert sum(durations) == 50 * shown, "what does not move is one frame that lasts"
+    assert sum(durations) == 150 * shown, "what does not move is one frame that lasts"
 
 
 def test_numbers_that_a_dataset_lacks_are_left_open(recording, tmp_path):

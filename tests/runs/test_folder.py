@@ -1,5 +1,6 @@
 """Run folders: settings that must be the same, metrics and training states that survive a kill."""
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -48,10 +49,12 @@ def test_a_run_reopens_with_the_same_settings_only(tmp_path):
 
 def test_a_run_that_has_not_begun_to_train_may_get_other_settings(tmp_path):
     open_run(tmp_path, Settings())
-    write_json(tmp_path / "dataset.json", {"sha256": "of other data"})
+    for name in ("dataset.json", "world_model.json"):
+        write_json(tmp_path / name, {"sha256": "of others"})
+    truncate_metrics(tmp_path, 0)  # a training begins, and fails in its first update
     open_run(tmp_path, Settings(names=("a",)))
     assert read_json(tmp_path / "config.json")["names"] == ["a"]
-    assert not (tmp_path / "dataset.json").exists()
+    assert {path.name for path in tmp_path.iterdir()} == {".lock", "config.json"}
 
 
 def test_a_run_that_is_older_than_a_setting_has_its_default(tmp_path):
@@ -76,7 +79,7 @@ def test_a_run_of_the_first_release_is_refused(tmp_path):
 def test_metrics_round_trip(tmp_path):
     assert read_metrics(tmp_path) == []
     append_metrics(tmp_path, 1, loss=torch.tensor(0.5), count=np.int64(3))
-    append_metrics(tmp_path, 2, loss=0.25, both=torch.tensor([1.0, 2.0]))
+    append_metrics(tmp_path, 2, loss=0.25, unknown=math.nan, both=torch.tensor([1.0, 2.0]))
     expected = [{"step": 1, "loss": 0.5, "count": 3}, {"step": 2, "loss": 0.25, "both": [1.0, 2.0]}]
     assert read_metrics(tmp_path) == expected
 

@@ -11,7 +11,7 @@ from small import CONSTANTS, POLICY, Stop, judge, make_episodes, make_model, rea
 
 from dynmap_rl.training import PolicyTraining, decoupled, train_policies
 from dynmap_rl.utils.devices import Compute
-from dynmap_rl.utils.files import read_json
+from dynmap_rl.utils.files import read_json, write_json
 from dynmap_rl.utils.weights import fingerprint
 
 
@@ -77,6 +77,27 @@ def test_a_finished_seed_is_left_alone(tmp_path, monkeypatch):
     train(tmp_path, judge=stop)
     with pytest.raises(ValueError, match="other settings"):
         train(tmp_path, settings=replace(POLICY, kind="feedforward"))
+
+
+def test_another_world_model_beside_a_finished_seed_is_refused_and_overwrites_nothing(tmp_path):
+    """The finished policy belongs to the one that is there."""
+    train(tmp_path)
+    other, before = make_model(), read_weights(tmp_path)
+    with torch.no_grad():
+        next(other.parameters()).add_(1e-3)
+    with pytest.raises(ValueError, match="another world model"):
+        train(tmp_path, other, seeds=(0, 1))
+    assert read_weights(tmp_path) == before
+
+
+def test_a_policy_that_is_older_than_a_setting_has_its_default(tmp_path):
+    train(tmp_path)
+    stored = read_json(tmp_path / "seed_0/trained.json")
+    del stored["settings"]["corrections"]
+    write_json(tmp_path / "seed_0/trained.json", stored)
+    train(tmp_path, judge=stop)
+    with pytest.raises(ValueError, match="other settings"):
+        train(tmp_path, settings=replace(POLICY, corrections=1), task="balance_reaching")
 
 
 def test_a_policy_sees_the_states_of_augmented_copies(tmp_path, monkeypatch):

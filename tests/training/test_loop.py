@@ -49,6 +49,17 @@ def test_a_folder_with_a_training_of_other_settings_is_refused(tmp_path):
             train_world_model(make_model(), make_episodes(), tmp_path, replace(WORLD_MODEL, **change))
 
 
+def test_a_training_that_is_older_than_a_setting_has_its_default(tmp_path):
+    train_world_model(make_model(), make_episodes(), tmp_path, WORLD_MODEL)
+    path = tmp_path / "checkpoint/world_model.pt"
+    state = torch.load(path, weights_only=True)
+    del state["form"]["labelled"]
+    torch.save(state, path)
+    train_world_model(make_model(), make_episodes(), tmp_path, WORLD_MODEL)
+    with pytest.raises(ValueError, match="other settings"):
+        train_world_model(make_model(), make_episodes(), tmp_path, replace(WORLD_MODEL, labelled=0.5))
+
+
 def test_a_training_resumes_from_a_state_of_another_kind_of_device(tmp_path):
     """The generators of a GPU have states of another shape."""
     train_world_model(make_model(), make_episodes(), tmp_path, WORLD_MODEL)

@@ -1,5 +1,7 @@
 """Training of a policy on the states of a frozen world model."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from small import CONSTANTS, POLICY, make_episodes, make_model
@@ -41,3 +43,13 @@ def test_a_loss_that_is_not_finite_stops_the_training(tmp_path, model, features)
     with pytest.raises(ValueError, match="not finite"):
         train_policy(make_policy(CONSTANTS, "recurrent", model), features, features, tmp_path, POLICY)
     assert read_metrics(tmp_path) == []
+
+
+def test_a_policy_that_goes_on_is_not_held_to_its_own_low_loss(tmp_path, model, features):
+    """With the states of corrections its loss rises at once, by any factor."""
+    policy, settings = make_policy(CONSTANTS, "recurrent", model, width=16), replace(POLICY, updates=200)
+    train_policy(policy, features, features, tmp_path, settings)
+    other = features.clone()
+    other["action"][0] += 50 * (other["action"].max() - other["action"].min())
+    few = replace(settings, batch=1)
+    train_policy(policy, torch.cat([features] * 20 + [other]), features, tmp_path, few, done=200, seed=1)

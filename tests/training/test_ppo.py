@@ -2,18 +2,18 @@
 
 import math
 import os
-import time
 from dataclasses import replace
 from functools import partial
 
 import pytest
 import torch
 from safetensors.torch import load_file
+from small import Stop, exit_elsewhere
 
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.envs.world import ACCELERATION_LIMIT
-from dynmap_rl.experts.network import ExpertNetwork
+from dynmap_rl.experts.network import ExpertNetwork, list_checkpoints
 from dynmap_rl.runs.folder import load_training_state, read_metrics, save_training_state
 from dynmap_rl.training import PPOTraining, ppo, train_ppo
 from dynmap_rl.utils.devices import seed_everything
@@ -68,6 +68,19 @@ def test_checkpoints_and_metrics(finished):
     assert any(not torch.equal(first[k], last[k]) for k in first)
 
 
+def test_a_checkpoint_is_listed_only_with_its_facts(tmp_path, monkeypatch):
+    """A kill between its two files leaves none."""
+
+    def die(*_):
+        raise Stop
+
+    monkeypatch.setattr(ppo, "write_json", die)
+    with pytest.raises(Stop):
+        train(tmp_path)
+    with pytest.raises(ValueError, match="no expert"):
+        list_checkpoints(tmp_path / "checkpoint")
+
+
 def test_a_rollout_may_go_on_after_the_time_limit(tmp_path):
     train(tmp_path, replace(SETTINGS, steps=130, iterations=1))
     assert math.isfinite(metrics(tmp_path)[0]["loss_critic"])
@@ -118,14 +131,6 @@ def test_a_loss_that_is_not_finite_keeps_the_last_state(tmp_path, monkeypatch):
     weights = load_file(tmp_path / "checkpoint/iteration_001.safetensors")
     assert all(value.isfinite().all() for value in weights.values())
     assert [row["step"] for row in metrics(tmp_path)] == [1]
-
-
-def exit_elsewhere(num_envs, own):
-    """Make an environment in the process ``own``, and end any other one."""
-    if os.getpid() != own:
-        os._exit(1)
-    time.sleep(1)  # until the other process has taken its share
-    return DynmapBatchedEnv("balance_reaching", num_envs, control="acceleration")
 
 
 def test_a_process_that_dies_is_an_error_and_the_training_resumes(finished, tmp_path):
