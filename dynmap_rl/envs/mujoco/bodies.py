@@ -28,7 +28,8 @@ class Body:
             and the axes are those of what is named; by default ``name``.
         orientation: ``full``: the x and the y axis of the body in the world, and the angular velocity. ``axis``: the z
             axis, for bodies that are symmetric about it, and the angular velocity without the part about that axis.
-            ``none``: neither, for balls and for grippers that do not turn.
+            ``none``: neither, for balls, and for what does not turn. The angular velocity of a body that lies on another
+            one may be noise of the contacts; look at it before you train on it.
     """
 
     name: str

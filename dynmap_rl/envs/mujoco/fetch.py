@@ -69,12 +69,16 @@ class FetchPush(FetchTask):
 
 
 class FetchSlide(FetchTask):
-    """Bring a puck to rest at a goal, which is often beyond the arm's reach, so that the puck must slide there."""
+    """Bring a puck to rest at a goal, which is often beyond the arm's reach, so that the puck must slide there.
+
+    The puck has no orientation in the columns: it lies flat, and its contacts make MuJoCo's angular velocity jump between
+    -3 and 3 rad/s while it rests.
+    """
 
     name = "fetch_slide"
     description = "Slide the black puck so that it comes to rest at the red dot."
     environment = "FetchSlide-v4"
-    bodies = (Body("puck", "object0", "axis"), Body("hand", "robot0:grip", "none"))
+    bodies = (Body("puck", "object0", "none"), Body("hand", "robot0:grip", "none"))
     views = (
         Camera("front", (1.26, 0.75, 0.42), 1.2, 180, -65),
         Camera("side", (1.3, 0.75, 0.42), 1.2, 90, -50),
