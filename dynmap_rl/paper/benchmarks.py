@@ -56,8 +56,10 @@ UPDATES = {  # of world models and policies, in the place of the defaults; chose
 PAGE = """# MuJoCo tasks
 
 Success in %, [95 % interval over the scenes], (success of each seed). The interval says nothing about further trainings, which
-differ by more. The numbers of updates of the RGB rows were chosen for each task on validation scenes; those of End-to-End, ACT and
-Diffusion Policy are the recipes' defaults. Derived dynamics (of the hand, tracked, hand and color) are explained in
+differ by more. The numbers of updates of the RGB rows were chosen for each task on validation scenes, in single development runs
+that are not stored; those of End-to-End, ACT and Diffusion Policy are the recipes' defaults. On PlateSlide, plate and hand always
+start in the same places: the goal, which policies are given, determines what to do, so that its column says nothing about
+perception. Derived dynamics (of the hand, tracked, hand and color) are explained in
 [dynmap_rl/data/README.md](../../../dynmap_rl/data/README.md#which-source). Tasks, cameras and experts are described in
 [dynmap_rl/envs/mujoco/README.md](../../../dynmap_rl/envs/mujoco/README.md). Written by
 `python recipes/paper/benchmarks3d.py --write` from the files in this folder.
@@ -78,7 +80,8 @@ other failures the cause is where the object is in the last frame, as seen from 
 
 {failures}
 
-Mean distance of the object's predicted and true positions in these episodes, one step ahead: {localization}.
+Mean distance of the object's predicted and true positions in these episodes, one step ahead: {localization}. Which other entries
+of the dynamics are learned: [dynmap_rl/envs/mujoco/README.md](../../../dynmap_rl/envs/mujoco/README.md#dynamics).
 
 ## Episodes
 
