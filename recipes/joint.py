@@ -15,7 +15,7 @@ from pathlib import Path
 
 from dynmap_rl.evaluation.settings import Evaluation
 from dynmap_rl.training.settings import JointTraining, PolicyArchitecture, WorldModelArchitecture
-from dynmap_rl.utils.cli import command_line, parse_seeds, run_recipe
+from dynmap_rl.utils.cli import command_line, parse_seeds, refuse, run_recipe
 from dynmap_rl.utils.devices import RankedCompute
 from dynmap_rl.utils.ray_train import train_by_ray
 
@@ -72,6 +72,8 @@ def main(config: Config) -> None:
     choose_device(config.compute.device)
     augmentation = choose_augmentation(task, config.training.augmentation, imitated=True)
     check_window_steps(config.training, task.layout.steps, "training")
+    if config.world_model.supervision == "none":
+        refuse(config.training, JointTraining(), ["beta_dynamics"], "supervision none", "training.")
     check_logger(config.logger)
     if config.dataset:
         check_dataset(config.dataset, config.task)

@@ -67,6 +67,13 @@ def test_its_world_model_on_task_3(place, recipe):
     assert shas[0] == shas[1]
 
 
+def test_the_weight_of_no_dynamics_is_refused(tmp_path):
+    options = "--world_model.supervision", "none", "--training.beta_dynamics", "2"
+    result = run(tmp_path, "joint", *options)
+    assert result.returncode == 2 and "--training.beta_dynamics has no effect" in result.stderr
+    assert not any(tmp_path.iterdir())
+
+
 def test_end_to_end_training_has_no_dynamics(tmp_path):
     result = run(tmp_path, "end_to_end", "--world_model.supervision", "velocity")
     assert result.returncode == 2 and "supervision must be none" in result.stderr
