@@ -1,11 +1,12 @@
-"""Frames a second of recording demonstrations of the MuJoCo tasks, beside the benchmarks' own rendering.
+"""Frames a second of recording and of LeRobot's evaluation of the MuJoCo tasks, beside the benchmarks' own rendering.
 
     uv run --extra mujoco python tests/benchmarks/recording3d.py
     uv run --extra mujoco python tests/benchmarks/recording3d.py --tasks Soccer --episodes 5 --output found.json
 
-``ours`` records a dataset, with resets, failures of the expert, dynamics, frames and files. ``theirs`` takes random actions
-in the benchmark's environment and calls ``env.render()``, at the same size. Both have one thread, and turns of some seconds,
-so that a machine whose speed changes is equally fast for both. The rates are by the time of the processor (which leaves out
+``ours`` records a dataset, with resets, failures of the expert, dynamics, frames and files. ``lerobot`` takes random actions in
+four worlds of ``lerobot-eval --env.type=dynmap --eval.use_async_envs=false``, without a policy. ``theirs`` takes random actions
+in the benchmark's environment and calls ``env.render()``, at the same size. All have one thread, and turns of some seconds, so
+that a machine whose speed changes is equally fast for all. The rates are by the time of the processor (which leaves out
 other load) and by the clock; loading the model, once a process, is left out.
 Writes ``recipes/results/measurements/recording3d.json``.
 """
@@ -18,6 +19,7 @@ import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
 from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -96,16 +98,33 @@ def render(task: str, frames: int) -> dict[str, float]:
     return measure(run)
 
 
+def evaluate(task: str, frames: int) -> dict[str, float]:
+    """Measure LeRobot's environment with four worlds, with random actions."""
+    from dynmap_rl.integrations.lerobot.environment import DynmapEnvConfig
+
+    env = DynmapEnvConfig(task=f"mujoco:{task}").create_envs(4)["dynmap"][0]
+    env.reset(seed=0)
+
+    def run() -> int:
+        for _ in range(max(1, frames // 4)):
+            env.step(env.action_space.sample())
+        return 4 * max(1, frames // 4)
+
+    return measure(run)
+
+
 def compare(task: str, episodes: int, frames: int, rounds: int) -> dict:
     """Measure a task, each part in a process of its own: renderers of one process share their settings."""
-    parts = {"ours": (record, task, episodes), "theirs": (render, task, frames)}
+    parts = {
+        "ours": (record, task, episodes),
+        "lerobot": (evaluate, task, 10 * frames),
+        "theirs": (render, task, frames),
+    }
     found = {name: [] for name in parts}
-    with (
-        ProcessPoolExecutor(1, get_context("spawn")) as first,
-        ProcessPoolExecutor(1, get_context("spawn")) as second,
-    ):
+    with ExitStack() as stack:
+        pools = [stack.enter_context(ProcessPoolExecutor(1, get_context("spawn"))) for _ in parts]
         for _ in range(rounds):
-            for pool, (name, call) in zip((first, second), parts.items(), strict=True):
+            for pool, (name, call) in zip(pools, parts.items(), strict=True):
                 found[name].append(pool.submit(*call).result())
     totals = {name: {key: sum(row[key] for row in rows) for key in rows[0]} for name, rows in found.items()}
     rates = {name: {key: t["frames"] / t[key] for key in ("cpu", "clock")} for name, t in totals.items()}
@@ -128,7 +147,8 @@ def main() -> None:
         for task in options.tasks.split(",")
     }
     for task, row in rows.items():
-        print(f"{task}: {row['ours']['cpu']:.0f} frames/s of one core, theirs {row['theirs']['cpu']:.0f}")
+        rates = (f"{name} {row[name]['cpu']:.0f}" for name in ("ours", "lerobot", "theirs"))
+        print(f"{task}, frames/s of one core: {', '.join(rates)}")
     write_json(options.output, {"tasks": rows, "command": command_line(sys.argv), "commit": find_commit()})
 
 

@@ -207,7 +207,7 @@ def test_recording_is_compared_with_the_benchmarks_own_rendering(load, tmp_path,
     monkeypatch.setattr("sys.argv", ["x.py", *arguments])
     load("recording3d").main()
     row = read_json(output)["tasks"]["FetchPush"]
-    assert all(row[who][time] > 0 for who in ("ours", "theirs") for time in ("cpu", "clock"))
+    assert all(row[who][time] > 0 for who in ("ours", "lerobot", "theirs") for time in ("cpu", "clock"))
 
 
 @pytest.mark.slow
