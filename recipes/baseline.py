@@ -147,7 +147,8 @@ def load(config: Config, folder: Path, device: str):
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.integrations.lerobot import LeRobotActor
 
-    return LeRobotActor(folder / "lerobot" / TRAINED, device, get_task(config.task).description)
+    task = get_task(config.task)
+    return LeRobotActor(folder / "lerobot" / TRAINED, device, task.description, task=task)
 
 
 def report(config: Config, dataset: str | Path, folder: Path, seeds: list[int]) -> dict:

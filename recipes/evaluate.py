@@ -103,7 +103,7 @@ def judge_policy(config: Config) -> tuple[Path, str, dict]:
 
     delay, folder = read_delay(config), find_run(config.policy)
     task = config.task or task_of_run(folder) or "balance_reaching"
-    actor = load_policy(config, folder, get_task(task, from_file=not config.task).description)
+    actor = load_policy(config, folder, get_task(task, from_file=not config.task))
     if delay and not config.stale:
         if not isinstance(actor, Actor):
             raise ValueError("--policy must be a run for --delay; add --stale for a LeRobot policy")
@@ -131,8 +131,8 @@ def read_delay(config: Config):
     return delay
 
 
-def load_policy(config: Config, folder: Path, instruction: str):
-    """Load the actor of a run, or a LeRobot policy, which gets the task as an instruction."""
+def load_policy(config: Config, folder: Path, task):
+    """Load the actor of a run, or a LeRobot policy, which gets the task's description as an instruction."""
     import torch
 
     from dynmap_rl.runs.lookup import has_world_model, load_actor
@@ -154,7 +154,8 @@ def load_policy(config: Config, folder: Path, instruction: str):
         ) from error
     refuse(config, Config(), ["seed"], "a LeRobot policy")
     torch.set_num_threads(config.compute.threads)
-    return LeRobotActor(config.policy, choose_device(config.compute.device), instruction=instruction)
+    device = choose_device(config.compute.device)
+    return LeRobotActor(config.policy, device, task.description, task=task)
 
 
 def judge_expert(config: Config) -> tuple[Path, str, dict]:

@@ -18,6 +18,13 @@ os.environ["TQDM_DISABLE"] = "1"
 import pytest
 import torch
 
+from dynmap_rl.utils.graphics import check_mujoco_gl
+
+try:
+    check_mujoco_gl()
+except OSError as error:  # otherwise every file of tests that imports TorchRL fails
+    raise pytest.UsageError(str(error)) from error
+
 torch.set_num_threads(1)
 ROOT = Path(__file__).parents[1]
 

@@ -10,6 +10,8 @@ import sys
 
 import numpy as np
 
+from dynmap_rl.utils.graphics import check_mujoco_gl
+
 from .geometry import (
     Polygon,
     bin_walls,
@@ -229,6 +231,7 @@ def get_task(name: str, from_file: bool = False, kind: type[BaseTask] = BaseTask
     Raises:
         ValueError: there is no task of this name, or the class is not a complete subclass of ``kind``, or its arguments
             are wrong.
+        OSError: the renderer that ``MUJOCO_GL`` names cannot be loaded.
     """
     task = TASKS.get(name) or _make_task(name, from_file)
     if not isinstance(task, kind):
@@ -251,6 +254,7 @@ def _make_task(name: str, from_file: bool) -> BaseTask:
     try:
         task = getattr(importlib.import_module(MUJOCO_MODULE if own else module), attribute)
     except (ImportError, AttributeError) as error:
+        check_mujoco_gl()
         hint = (
             "; MuJoCo tasks need uv pip install -e '.[mujoco]'"
             if own and isinstance(error, ImportError)

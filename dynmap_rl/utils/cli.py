@@ -19,6 +19,7 @@ import typing
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from .graphics import check_mujoco_gl
 from .settings import flatten, parse_numbers
 
 HINTS = {
@@ -52,7 +53,9 @@ def run_recipe(
     given = [argument for argument in argv[1:] if argument != "--debug"]
     debug = len(given) < len(argv) - 1
     try:
-        main(parse_settings(config_class, read_arguments(given, config_class)))
+        settings = parse_settings(config_class, read_arguments(given, config_class))
+        check_mujoco_gl()  # before TorchRL is imported
+        main(settings)
     except KeyboardInterrupt:
         sys.exit(f"stopped; {stopped}")
     except Exception as error:

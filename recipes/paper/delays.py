@@ -148,6 +148,7 @@ def evaluate_cell(config: Config, path: Path, result: dict, steps: int) -> None:
 
 def load_actor(config: Config, result: dict, delay) -> tuple:
     """Return the actor of a result, which bridges a delay where one is given, and the names of its row and policy."""
+    from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.modules.delayed_actor import DelayedActor
     from dynmap_rl.modules.supervision import row_name
     from dynmap_rl.runs.lookup import find_run, has_world_model, load_actor
@@ -158,7 +159,8 @@ def load_actor(config: Config, result: dict, delay) -> tuple:
     if not has_world_model(folder):
         from dynmap_rl.integrations.lerobot import LeRobotActor
 
-        actor = LeRobotActor(folder, cut=delay is not None)
+        device, task = choose_device(config.compute.device), get_task(result["task"])
+        actor = LeRobotActor(folder, device, cut=delay is not None, task=task)
         return actor, {"row": actor.policy.config.type, "policy": "LeRobot"}
     actor = load_actor(folder, config.seed).to(choose_device(config.compute.device))
     names = {"row": row_name(actor.world_model.supervision), "policy": actor.policy.kind}

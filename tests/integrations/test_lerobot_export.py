@@ -1,5 +1,8 @@
 """Conversion of run folders to LeRobot checkpoints and back."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import pytest
 import torch
 from lerobot.datasets import LeRobotDataset
@@ -7,6 +10,7 @@ from lerobot.policies import make_policy, make_policy_config, make_pre_post_proc
 from tensordict import TensorDict
 
 from dynmap_rl.data.derive import add_dynamics
+from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.integrations.lerobot.actor import LeRobotActor
 from dynmap_rl.integrations.lerobot.configuration_dynmap import DynmapConfig
 from dynmap_rl.integrations.lerobot.environment import DynmapEnvConfig
@@ -207,3 +211,50 @@ def test_frames_are_those_of_the_policys_cameras(tmp_path):
     assert "observation.images.front" not in seen[0]
     with pytest.raises(ValueError, match="2 cameras"):
         actor(td.set("pixels", frames))
+
+
+def make_task(*cameras, **changes):
+    """Return what an actor reads of a task in space, with the sizes of the flat tasks."""
+    layout = replace(get_task("balance_reaching").layout, cameras=cameras, **changes)
+    return SimpleNamespace(name="slide", description="Slide.", planar=False, layout=layout)
+
+
+def export_with_cameras(folder, *cameras):
+    """Export the shipped run as a policy that reads these cameras."""
+    path = export_to_lerobot("balance_reaching", folder)
+    settings = read_json(path / "config.json")
+    features = settings["input_features"]
+    front = features.pop("observation.images.front")
+    features |= {f"observation.images.{camera}": front for camera in cameras}
+    write_json(path / "config.json", settings)
+    return path
+
+
+def test_cameras_of_a_task_are_found_by_their_names(tmp_path):
+    frames = torch.randint(0, 256, (2, 3, 64, 128), dtype=torch.uint8)
+    actor = LeRobotActor(export_to_lerobot("balance_reaching", tmp_path), task=make_task("side", "front"))
+    seen, features = [], actor.policy.config.input_features
+    actor.policy.select_action = lambda batch: seen.append(batch) or torch.zeros(2, 3)
+    td = TensorDict({"pixels": frames, "agent_pos": torch.zeros(2, 5)}, [2])
+    actor(td)
+    features["observation.images.side"] = features["observation.images.front"]
+    actor(td)
+    side, front = (frames / 255).split(64, -1)
+    for batch in seen:
+        assert torch.equal(batch["observation.images.front"], front)
+    assert "observation.images.side" not in seen[0]
+    assert torch.equal(seen[1]["observation.images.side"], side)
+    with pytest.raises(ValueError, match="1 cameras, but it reads .*side, .*front"):
+        actor(td.set("pixels", frames[..., :64]))
+
+
+def test_a_policy_of_another_task_is_refused(tmp_path):
+    policy = export_with_cameras(tmp_path, "side")
+    LeRobotActor(policy, task=get_task("balance_reaching"))  # the picture of a flat task may have any name
+    with pytest.raises(ValueError, match="fit slide.* cameras side instead of front; choose the task"):
+        LeRobotActor(policy, task=make_task("front"))
+    task = make_task("front", "side", state=("goal_x",), action=("x",), action_limit=(1.0,))
+    with pytest.raises(
+        ValueError, match=r"has state \[5\] instead of \[1\], action \[3\] instead of \[1\]; choose"
+    ):
+        LeRobotActor(policy, task=task)

@@ -10,6 +10,7 @@ from torch import nn
 
 from dynmap_rl.envs.scene import scene_seed
 from dynmap_rl.envs.tasks import get_task
+from dynmap_rl.integrations import lerobot  # noqa: F401  registers the environment
 
 
 class Demonstrate(nn.Module):

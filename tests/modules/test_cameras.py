@@ -83,3 +83,16 @@ def test_latents_of_cameras_are_rolled_and_added():
         encoder(part) for encoder, part in zip(model.encoder.encoders, pixels.split(64, -1), strict=True)
     )
     torch.testing.assert_close(model.encode(pixels), first + second.roll(4, -1))
+
+
+@pytest.mark.parametrize("architecture", ["glimpse", "plain"])
+@torch.no_grad()
+def test_latents_are_rolled_back_for_the_decoders_of_cameras(architecture):
+    """Saved models of several cameras depend on it."""
+    model = make(architecture=architecture, cameras=2).eval()
+    states = model.predict(model.encode(draw(2, 3, 3, 64, 128)), torch.zeros(2, 3, 3))
+    shown = model.decode_pixels(*states)
+    latent, *hidden = states
+    first, second = model.image_decoder.decoders
+    frames = first(latent, *hidden), second(latent.roll(-4, -1), *hidden)
+    torch.testing.assert_close(shown, torch.cat(frames, -1))

@@ -1,11 +1,13 @@
 """A ``MUJOCO_GL`` that cannot be loaded: one line, whatever imports TorchRL or MuJoCo first."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from own_task import check_renderer
 
 pytest.importorskip("mujoco", reason="uv pip install -e '.[mujoco]'")
 
@@ -39,3 +41,10 @@ def test_python_and_tests_name_the_renderer(arguments, code):
     result = run("osmesa", *arguments)
     assert result.returncode == code
     assert "MUJOCO_GL must be a renderer" in result.stderr.strip().splitlines()[-1]
+
+
+def test_ci_fails_where_nothing_can_be_drawn():
+    code = re.search(r'python -c "(.*)"', (ROOT / ".ci/run").read_text())[1]
+    assert run("osmesa", "-c", code).returncode == 1
+    check_renderer()
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0

@@ -230,7 +230,11 @@ class MujocoTask(BaseTask):
             world.position_error = self.distance(world)
             if not self.is_solved(world):
                 return world
-            observation, info = world.env.reset()  # the next start of the same seed
+            if type(self).reset is MujocoTask.reset:
+                observation, info = world.env.reset()  # the next start of the same seed
+            else:  # env.reset alone may lack what the task's own reset does
+                seed = int(np.random.default_rng(seed % 2**32).integers(2**32))
+                observation, info = self.reset(world.env, seed)
         raise ValueError(f"{self.name} must have starts that are not solved, got {ATTEMPTS} solved ones")
 
     def _make_world(self) -> MujocoWorld:

@@ -8,10 +8,11 @@ import torch
 from draccus.utils import DraccusException
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
-from lerobot.utils.constants import OBS_STATE
+from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
+from dynmap_rl.envs.protocol import BaseTask
 from dynmap_rl.utils.hub import first_line
 
 
@@ -19,9 +20,8 @@ class LeRobotActor(TensorDictModuleBase):
     """Trained LeRobot policy as a TensorDict policy, one time step a call.
 
     It reads ``pixels`` ``[B, 3, S, cameras * S]`` and ``agent_pos`` and writes ``action`` ``[B, A]``, with the sizes of the
-    task's layout (see :class:`dynmap_rl.envs.Layout`). The cameras are those of the policy, in this order. Its memory
-    (chunks of actions, past observations) belongs to one batch of episodes, which all begin at the same time: call
-    :meth:`reset` before the first step of the next batch.
+    task's layout (see :class:`dynmap_rl.envs.Layout`). Its memory (chunks of actions, past observations) belongs to one
+    batch of episodes, which all begin at the same time: call :meth:`reset` before the first step of the next batch.
 
     Args:
         path: ``pretrained_model`` folder of ``lerobot-train``, or the id of a policy on the Hugging Face hub.
@@ -31,12 +31,14 @@ class LeRobotActor(TensorDictModuleBase):
             rather than from its first action. Needs a policy that predicts chunks from one observation, such as ACT.
             ``agent_pos`` is that of the present, and a chunk that is shorter than delay and ``n_action_steps`` together
             ends with repetitions of its last action.
+        task: task of the frames, whose cameras are found by their names; the picture of a flat task may have any name.
+            Without a task, the cameras are those of the policy, in its order.
 
     Raises:
-        ValueError: the folder or id holds no LeRobot policy, or ``cut`` is given and the policy predicts from several
-            observations.
+        ValueError: the folder or id holds no LeRobot policy, or the policy does not fit ``task``, or ``cut`` is given and
+            the policy predicts from several observations.
 
-    Calling it raises ``ValueError`` where the policy has another number of cameras.
+    Calling it raises ``ValueError`` where the frames are those of another number of cameras.
     """
 
     in_keys = ["pixels", "agent_pos"]
@@ -48,9 +50,10 @@ class LeRobotActor(TensorDictModuleBase):
         device: torch.device | str = "cpu",
         instruction: str = "",
         cut: bool = False,
+        task: BaseTask | None = None,
     ):
         super().__init__()
-        self.instruction, self.cut = instruction, cut
+        self.instruction, self.cut, self.cameras = instruction, cut, None
         try:
             config = PreTrainedConfig.from_pretrained(str(path))
             config.device = str(device)
@@ -68,6 +71,10 @@ class LeRobotActor(TensorDictModuleBase):
             raise ValueError(
                 f"cut must be False for the policy type {config.type}, which predicts from {config.n_obs_steps} observations"
             )
+        if task:
+            check_config(config, task)
+            if not task.planar:
+                self.cameras = [f"{OBS_IMAGES}.{camera}" for camera in task.layout.cameras]
         self.reset()
 
     def reset(self) -> None:
@@ -82,11 +89,13 @@ class LeRobotActor(TensorDictModuleBase):
         frames = tensordict["pixels"].float() / 255
         frames = frames.split(frames.shape[-2], -1)
         names = list(self.policy.config.image_features)
-        if len(names) != len(frames):
+        cameras = self.cameras or names
+        if len(cameras) != len(frames):
             raise ValueError(
-                f"the policy must read {len(frames)} cameras, but it reads {', '.join(names) or 'none'}"
+                f"the policy must read {len(frames)} cameras, but it reads {', '.join(cameras) or 'none'}"
             )
-        observation = dict(zip(names, frames, strict=True)) | {OBS_STATE: tensordict["agent_pos"]}
+        pictures = dict(zip(cameras, frames, strict=True))
+        observation = {name: pictures[name] for name in names} | {OBS_STATE: tensordict["agent_pos"]}
         batch = before({**observation, "task": [self.instruction] * len(tensordict)})
         action = self._cut(batch, tensordict["delay"]) if self.cut else self.policy.select_action(batch)
         return tensordict.set("action", after(action).to(tensordict["agent_pos"]))
@@ -99,3 +108,24 @@ class LeRobotActor(TensorDictModuleBase):
         place = (self._first + self._next).clamp(max=last)[..., None].expand(-1, -1, self._chunk.shape[2])
         self._next += 1
         return self._chunk.gather(1, place)[:, 0]
+
+
+def check_config(config: PreTrainedConfig, task: BaseTask) -> None:
+    """Raise ``ValueError`` where a policy reads other cameras, or has other sizes, than the layout of a task."""
+    layout, wrong = task.layout, []
+    names = [name.removeprefix(f"{OBS_IMAGES}.") for name in config.image_features]
+    if not names or (len(names) > 1 if task.planar else set(names) - set(layout.cameras)):
+        found, expected = (", ".join(some) or "none" for some in (names, layout.cameras))
+        wrong.append(f"the cameras {found} instead of {expected}")
+    sizes = {
+        "state": (config.robot_state_feature, layout.state),
+        "action": (config.action_feature, layout.action),
+    }
+    for name, (feature, entries) in sizes.items():
+        if feature and tuple(feature.shape) != (len(entries),):
+            wrong.append(f"{name} {list(feature.shape)} instead of {[len(entries)]}")
+    if wrong:
+        raise ValueError(
+            f"the policy must fit {task.name}, but it has {', '.join(wrong)}; choose the task that it was trained on, "
+            "with its cameras, as in mujoco:PlateSlide:cameras=2"
+        )
