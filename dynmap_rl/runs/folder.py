@@ -17,8 +17,8 @@ from dynmap_rl.utils.ranks import first_rank_first, rank
 from dynmap_rl.utils.settings import flatten
 
 FORMAT = 2  # of config.json; the first release had flat settings
-# Files of a run that has failed before its training, of which the second and the third are of a dataset or world model.
-UNTRAINED = ".lock", "dataset.json", "world_model.json", "config.json"
+INPUTS = {"dataset.json", "world_model.json"}  # hashes of what a run has begun with
+UNTRAINED = {".lock", "config.json"} | INPUTS  # files of a run that has failed before its training
 
 
 def open_run(folder: Path, config, *, ignore: tuple[str, ...] = ()) -> Path:
@@ -48,9 +48,9 @@ def _open(folder: Path, config, ignore: tuple[str, ...]) -> Path:
         lock_folder(folder)
     settings = {"format": FORMAT, **plain_settings(config)}
     path = folder / "config.json"
-    untrained = {file.name for file in folder.iterdir()} <= set(UNTRAINED)
+    untrained = {file.name for file in folder.iterdir()} <= UNTRAINED
     if not path.exists() or (untrained and not rank()):
-        for name in UNTRAINED[1:3]:
+        for name in INPUTS:
             (folder / name).unlink(missing_ok=True)
         write_json(path, settings)
         return folder

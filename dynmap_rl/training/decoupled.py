@@ -100,7 +100,9 @@ def train_policies(
     check_corrections(settings, task)
     check_copies(settings, task)
     for path in (folder / f"seed_{seed}" / TRAINED for seed in seeds):
-        if path.exists() and compare_settings(read_json(path).get("settings", {}), settings):
+        if path.exists() and compare_settings(
+            read_json(path).get("settings", plain_settings(settings)), settings
+        ):
             raise ValueError(f"{path.parent} holds a policy with other settings; choose another folder")
     world_model.eval().requires_grad_(False)
     frozen = fingerprint(world_model)

@@ -91,7 +91,7 @@ def fit(
     one = replace(settings, updates=1)
     form = plain_settings(one) | {"seed": seed}
     if state := load_training_state(path):
-        stored = state.get("form", form)
+        stored = dict(state.get("form", form))
         other = stored.pop("seed") != form["seed"] or compare_settings(stored, one)
         if other or state["update"] > settings.updates:
             raise ValueError(f"{folder} holds a training with other settings; choose another folder")

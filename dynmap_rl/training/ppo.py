@@ -138,9 +138,8 @@ def train_ppo(
                 path = folder / "checkpoint" / f"iteration_{iteration + 1:03d}"
                 at = {"iteration": iteration + 1, "frames": metrics["frames"], "seconds": round(seconds, 1)}
                 write_json(path.with_suffix(".json"), judged | facts | at)
-                save_weights(
-                    path.with_suffix(".safetensors"), network
-                )  # last: a checkpoint is there if these are
+                # Last: a checkpoint is listed by its weights.
+                save_weights(path.with_suffix(".safetensors"), network)
                 rates = f"success {judged['success']:.1%}, drop {judged['drop']:.1%}"
                 progress.write(f"iteration {iteration + 1}: {rates}")
             save_training_state(

@@ -58,6 +58,9 @@ def test_a_training_that_is_older_than_a_setting_has_its_default(tmp_path):
     train_world_model(make_model(), make_episodes(), tmp_path, WORLD_MODEL)
     with pytest.raises(ValueError, match="other settings"):
         train_world_model(make_model(), make_episodes(), tmp_path, replace(WORLD_MODEL, labelled=0.5))
+    del state["form"]  # older still
+    torch.save(state, path)
+    train_world_model(make_model(), make_episodes(), tmp_path, replace(WORLD_MODEL, updates=8))
 
 
 def test_a_training_resumes_from_a_state_of_another_kind_of_device(tmp_path):
