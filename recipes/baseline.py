@@ -147,8 +147,7 @@ def load(config: Config, folder: Path, device: str):
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.integrations.lerobot import LeRobotActor
 
-    task = get_task(config.task)
-    return LeRobotActor(folder / "lerobot" / TRAINED, device, task.description, task=task)
+    return LeRobotActor(folder / "lerobot" / TRAINED, device, get_task(config.task))
 
 
 def report(config: Config, dataset: str | Path, folder: Path, seeds: list[int]) -> dict:

@@ -154,8 +154,7 @@ def load_policy(config: Config, folder: Path, task):
         ) from error
     refuse(config, Config(), ["seed"], "a LeRobot policy")
     torch.set_num_threads(config.compute.threads)
-    device = choose_device(config.compute.device)
-    return LeRobotActor(config.policy, device, task.description, task=task)
+    return LeRobotActor(config.policy, choose_device(config.compute.device), task)
 
 
 def judge_expert(config: Config) -> tuple[Path, str, dict]:

@@ -64,6 +64,22 @@ def prediction_errors(
     return {name: sums[name] / (counts[name] or torch.nan) for name in counts}
 
 
+def naive_errors(values: torch.Tensor) -> dict[str, list[float]]:
+    """Return the mean absolute errors of two simple predictions of every entry.
+
+    Args:
+        values: ``[E, T, D]``, NaN where a value is not known.
+
+    Returns:
+        ``constant``: errors of the best constant, ``[D]``. ``earlier``: those of the value one step earlier.
+    """
+    flat = values.flatten(0, 1)
+    return {
+        "constant": (flat - flat.nanmedian(0).values).abs().nanmean(0).tolist(),
+        "earlier": values.diff(dim=1).abs().nanmean((0, 1)).tolist(),
+    }
+
+
 @torch.no_grad()
 def policy_errors(policy: nn.Module, features: TensorDictBase) -> dict[str, float]:
     """Measure the errors of a policy's actions.

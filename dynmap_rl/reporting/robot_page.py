@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDictBase
 
 from dynmap_rl.data.robot import describe_robot_dataset
-from dynmap_rl.evaluation.errors import known_dynamics
+from dynmap_rl.evaluation.errors import known_dynamics, naive_errors
 from dynmap_rl.evaluation.probing import judged_text
 from dynmap_rl.modules.supervision import row_name
 from dynmap_rl.modules.world_model import WorldModel
@@ -72,6 +72,7 @@ def write_robot_report(
     described = describe_robot_dataset(dataset, camera, goal)
     names, dt = described["names"], 1 / (described["info"].get("fps") or 1)
     names = {key: names[key] for key in (*world_model.supervision, "action")}
+    naive = {quantity: naive_errors(_values(episodes, quantity)) for quantity in names}
     result = {
         "row": row_name(world_model.supervision, origin["training"]),
         "policy": policy,
@@ -86,8 +87,8 @@ def write_robot_report(
         "judged": judged,
         "held_out": {"rgb": errors["error_rgb"], "imitation_l1": errors["imitation_l1"]}
         | {q: {n: errors[f"error_{q}_{i}"] for i, n in enumerate(own)} for q, own in names.items()},
-        "spread": {q: dict(zip(own, _spread(episodes, q), strict=True)) for q, own in names.items()},
-        "change": {q: dict(zip(own, _change(episodes, q), strict=True)) for q, own in names.items()},
+        "spread": {q: dict(zip(own, naive[q]["constant"], strict=True)) for q, own in names.items()},
+        "change": {q: dict(zip(own, naive[q]["earlier"], strict=True)) for q, own in names.items()},
         "settings": settings,
         "command": command,
         "commit": find_commit(),
@@ -130,12 +131,3 @@ def _values(episodes: TensorDictBase, quantity: str) -> torch.Tensor:
         return known_dynamics(episodes, quantity)
     action, ignore = find_target(episodes)
     return action if ignore is None else action.where(~ignore, torch.nan)
-
-
-def _change(episodes: TensorDictBase, quantity: str) -> list[float]:
-    return _values(episodes, quantity).diff(dim=1).abs().nanmean((0, 1)).tolist()
-
-
-def _spread(episodes: TensorDictBase, quantity: str) -> list[float]:
-    values = _values(episodes, quantity).flatten(0, 1)
-    return (values - values.nanmedian(0).values).abs().nanmean(0).tolist()

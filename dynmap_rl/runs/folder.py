@@ -59,8 +59,9 @@ def _open(folder: Path, config, ignore: tuple[str, ...]) -> Path:
         raise ValueError(
             f"{folder} holds a run of another release, which cannot resume here; choose another --run"
         )
-    changed = compare_settings(stored, config)
-    if changed := {k: v for k, v in changed.items() if not {k, k.partition(".")[0]} & {*ignore, "format"}}:
+    given = {*ignore, "format"}
+    differ = compare_settings(stored, config).items()
+    if changed := {k: v for k, v in differ if not {k, k.partition(".")[0]} & given}:
         detail = ", ".join(f"{name}: {old} there, {new} here" for name, (old, new) in changed.items())
         raise ValueError(
             f"{folder} holds a run with other settings ({detail}); choose another --run, or delete the folder"

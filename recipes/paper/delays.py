@@ -155,14 +155,13 @@ def load_actor(config: Config, result: dict, delay) -> tuple:
     from dynmap_rl.training.dataset import find_or_record
     from dynmap_rl.utils.devices import choose_device
 
-    folder = find_run(result["run"])
+    folder, device = find_run(result["run"]), choose_device(config.compute.device)
     if not has_world_model(folder):
         from dynmap_rl.integrations.lerobot import LeRobotActor
 
-        device, task = choose_device(config.compute.device), get_task(result["task"])
-        actor = LeRobotActor(folder, device, cut=delay is not None, task=task)
+        actor = LeRobotActor(folder, device, get_task(result["task"]), cut=delay is not None)
         return actor, {"row": actor.policy.config.type, "policy": "LeRobot"}
-    actor = load_actor(folder, config.seed).to(choose_device(config.compute.device))
+    actor = load_actor(folder, config.seed).to(device)
     names = {"row": row_name(actor.world_model.supervision), "policy": actor.policy.kind}
     if result["condition"] == "past_actions":
         names["policy"] = "feedforward"

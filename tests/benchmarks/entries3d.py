@@ -18,7 +18,7 @@ import torch
 
 from dynmap_rl.data import load_demonstrations
 from dynmap_rl.envs.tasks import get_task
-from dynmap_rl.evaluation.errors import prediction_errors
+from dynmap_rl.evaluation.errors import naive_errors, prediction_errors
 from dynmap_rl.modules.checkpoints import load_world_model
 from dynmap_rl.utils.cli import command_line
 from dynmap_rl.utils.files import read_json, write_json
@@ -36,11 +36,9 @@ def measure(run: Path) -> tuple[str, dict]:
     errors = prediction_errors(world_model, episodes, by_entry=True)
     entries = {}
     for quantity, names in (("position", task.layout.position), ("velocity", task.layout.velocity)):
-        values = episodes["dynamics", quantity]
-        constant = (values - values.flatten(0, 1).median(0).values).abs().mean((0, 1)).tolist()
-        earlier = values.diff(dim=1).abs().mean((0, 1)).tolist()
+        naive = naive_errors(episodes["dynamics", quantity])
         for i, name in enumerate(names):
-            found = {"error": errors[f"error_{quantity}_{i}"], "constant": constant[i], "earlier": earlier[i]}
+            found = {"error": errors[f"error_{quantity}_{i}"]} | {key: row[i] for key, row in naive.items()}
             entries[f"{quantity} {name}"] = {key: round(value, 5) for key, value in found.items()}
     print(f"{config['task']}, error / constant (value one step earlier / constant)")
     for name, row in entries.items():

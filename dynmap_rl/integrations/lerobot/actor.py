@@ -26,13 +26,13 @@ class LeRobotActor(TensorDictModuleBase):
     Args:
         path: ``pretrained_model`` folder of ``lerobot-train``, or the id of a policy on the Hugging Face hub.
         device: device to run on.
-        instruction: text for policies that read one; datasets of the tasks have the task's ``description``.
+        task: task of the frames, whose cameras are found by their names; the picture of a flat task may have any name. Its
+            ``description`` is the text for policies that read one. Without a task, the cameras are those of the policy, in
+            its order, and the text is empty.
         cut: on late frames, execute a chunk from its action for the present step, by the entry ``delay`` ``[B, 1]``,
             rather than from its first action. Needs a policy that predicts chunks from one observation, such as ACT.
             ``agent_pos`` is that of the present, and a chunk that is shorter than delay and ``n_action_steps`` together
             ends with repetitions of its last action.
-        task: task of the frames, whose cameras are found by their names; the picture of a flat task may have any name.
-            Without a task, the cameras are those of the policy, in its order.
 
     Raises:
         ValueError: the folder or id holds no LeRobot policy, or the policy does not fit ``task``, or ``cut`` is given and
@@ -48,12 +48,11 @@ class LeRobotActor(TensorDictModuleBase):
         self,
         path: str | Path,
         device: torch.device | str = "cpu",
-        instruction: str = "",
-        cut: bool = False,
         task: BaseTask | None = None,
+        cut: bool = False,
     ):
         super().__init__()
-        self.instruction, self.cut, self.cameras = instruction, cut, None
+        self.instruction, self.cut, self.cameras = task.description if task else "", cut, None
         try:
             config = PreTrainedConfig.from_pretrained(str(path))
             config.device = str(device)
