@@ -24,6 +24,10 @@ DERIVED = {  # rows whose dynamics need no simulator: name of their dataset, and
     "RGB+[P+V], tracked": ("tracks", {"source": "tracks", "objects": 2}),
     "RGB+[P+V], hand and color": ("color", HAND | {"source": "state,tracks", "point": True}),
 }
+FRAMES = {  # rows with other frames: arguments of the task
+    "RGB+[P+V], 96 pixels": ":image_size=96",
+    "RGB+[P+V], two cameras": ":cameras=2",
+}
 COLORS = {"FetchPush": {"colors": ["#1c1c1c"], "threshold": 24}}  # of the object, where it has one of its own
 METHODS = {  # by the row of the table: recipe and its options
     "Only-RGB": ("decoupled", ("--world_model.supervision", "none")),
@@ -32,6 +36,8 @@ METHODS = {  # by the row of the table: recipe and its options
     **{row: ("decoupled", ("--world_model.supervision", "position,velocity")) for row in DERIVED},
     "RGB+[P+V], ResNet-18": ("decoupled", ("--world_model.architecture", "resnet18")),
     "RGB+[P+V], ViT": ("decoupled", ("--world_model.architecture", "vit")),
+    **{row: ("decoupled", ("--world_model.supervision", "position,velocity")) for row in FRAMES},
+    "RGB+[P+V], Joint": ("joint", ()),
     "End-to-End": ("end_to_end", ()),
     "ACT": ("baseline", ("--policy", "act")),
     "Diffusion Policy": ("baseline", ("--policy", "diffusion")),
@@ -107,14 +113,15 @@ def list_benchmarks(episodes: int = 500) -> dict[tuple[str, str, int], Run]:
             if method in DERIVED and derived_columns(task, method) is None:
                 continue
             for seed in SEEDS:
-                arguments = ["--task", f"mujoco:{task}", *options, "--seeds", str(seed)]
+                name = f"mujoco:{task}{FRAMES.get(method, '')}"
+                arguments = ["--task", name, *options, "--seeds", str(seed)]
                 if recipe == "decoupled":
                     arguments += ["--world_model.seed", str(seed), *UPDATES.get(task, ())]
                 arguments += ["--dataset", str(derived_dataset(task, method))] if method in DERIVED else []
                 arguments += ["--eval.episodes", str(episodes), "--eval.paper_episodes", "0"]
-                cell = f"mujoco:{task}", recipe, "recurrent", method
-                name = name_run(task, method, seed)
-                runs[task, method, seed] = Run(name, recipe, cell, tuple(arguments), table="mujoco")
+                cell = name, recipe, "recurrent", method
+                run = name_run(task, method, seed)
+                runs[task, method, seed] = Run(run, recipe, cell, tuple(arguments), table="mujoco")
     return runs
 
 

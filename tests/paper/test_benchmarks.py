@@ -9,6 +9,7 @@ from dynmap_rl.evaluation.protocol import pack_rows
 from dynmap_rl.evaluation.statistics import welch_interval
 from dynmap_rl.paper.benchmarks import (
     COLORS,
+    FRAMES,
     METHODS,
     SEEDS,
     TASKS,
@@ -21,7 +22,7 @@ from dynmap_rl.paper.benchmarks import (
 )
 from dynmap_rl.utils.cli import parse_settings, read_arguments
 from dynmap_rl.utils.files import read_json, write_json
-from recipes import baseline, decoupled, end_to_end
+from recipes import baseline, decoupled, end_to_end, joint
 
 
 def make_result(success, first=0):
@@ -43,15 +44,19 @@ def make_result(success, first=0):
 def test_every_cell_is_a_command_that_its_recipe_understands():
     cells, recipes = (
         list_benchmarks(7),
-        {"baseline": baseline, "decoupled": decoupled, "end_to_end": end_to_end},
+        {"baseline": baseline, "decoupled": decoupled, "end_to_end": end_to_end, "joint": joint},
     )
     rows = len(TASKS) * (len(METHODS) - 1) + len(COLORS)  # one row is of the tasks whose object has a colour
     assert len(cells) == rows * len(SEEDS) == len({cell.name for cell in cells.values()})
-    for (task, _, seed), cell in cells.items():
+    for (task, method, seed), cell in cells.items():
         config = parse_settings(
             recipes[cell.recipe].Config, read_arguments(list(cell.arguments), recipes[cell.recipe].Config)
         )
-        assert (config.task, config.seeds, config.eval.episodes) == (f"mujoco:{task}", str(seed), 7)
+        assert (config.task, config.seeds, config.eval.episodes) == (
+            f"mujoco:{task}{FRAMES.get(method, '')}",
+            str(seed),
+            7,
+        )
         if cell.recipe == "decoupled":
             assert config.world_model.seed == seed
 
