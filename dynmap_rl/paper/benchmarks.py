@@ -10,6 +10,7 @@ from statistics import fmean
 from dynmap_rl.data.derive import add_dynamics
 from dynmap_rl.evaluation.protocol import result_rows
 from dynmap_rl.evaluation.statistics import shared_interval, summarize
+from dynmap_rl.reporting.media import choose_episodes
 from dynmap_rl.utils.files import read_json
 
 from .cells import Run
@@ -91,7 +92,7 @@ of the dynamics are learned: [dynmap_rl/envs/mujoco/README.md](../../../dynmap_r
 
 ## Episodes
 
-Eight episodes of the first seed. Upper row: failures, where there are any; lower row: successes.
+Eight episodes of the first seed, failures first; in brackets how they end, from left to right and from above.
 
 {animations}
 
@@ -245,10 +246,11 @@ def gap_table(rows: list[dict]) -> str:
 def benchmark_page(rows: list[dict], folder: Path) -> str:
     """Return the page of the results in Markdown, with the animations that are in the folder."""
     titles = [f"{row['task']}: {row['method']}" for row in rows]
+    runs = [name_run(row["task"], row["method"], SEEDS[0]) for row in rows]
     animations = [
-        f"{title}:\n\n![Episodes, failures first]({name})"
-        for title, row in zip(titles, rows, strict=True)
-        if (folder / (name := f"{name_run(row['task'], row['method'], SEEDS[0])}.gif")).exists()
+        f"{title} ({_outcomes(read_json(folder / f'{run}.json'))}):\n\n![Episodes, failures first]({run}.gif)"
+        for title, run in zip(titles, runs, strict=True)
+        if (folder / f"{run}.gif").exists()
     ]
     distances = [
         f"{title} {row['localization']:.0f} mm"
@@ -270,6 +272,13 @@ def benchmark_page(rows: list[dict], folder: Path) -> str:
         animations="\n\n".join(animations),
         commands="\n".join(commands),
     )
+
+
+def _outcomes(result: dict) -> str:
+    """Return what happens in the episodes of the animation, from left to right and from above."""
+    rows = choose_episodes(result["results"][0]["test"]["rows"])
+    causes = [row.get("cause", "fails") for row in rows if not row["success"]]
+    return ", ".join([*causes, f"{len(rows) - len(causes)} successes"])
 
 
 def _describe(row: dict) -> str:

@@ -94,7 +94,13 @@ def film_policy(
         delay: delay of the frames in that evaluation.
         failures: failures alone, where there are any.
     """
-    rows = unpack_rows(rows)
-    seeds, success = [row["scene_seed"] for row in rows], [row["success"] for row in rows]
-    some = failures_first(seeds, success, alone=failures)
+    some = [row["scene_seed"] for row in choose_episodes(rows, failures)]
     save_gif(roll_out(actor, task, some, True, delay)["pixels"], path, get_task(task).layout.dt)
+
+
+def choose_episodes(rows: dict, failures: bool = False) -> list[dict]:
+    """Return the rows of the episodes that :func:`film_policy` shows, in their order."""
+    rows = {row["scene_seed"]: row for row in unpack_rows(rows)}
+    return [
+        rows[s] for s in failures_first(list(rows), [r["success"] for r in rows.values()], alone=failures)
+    ]

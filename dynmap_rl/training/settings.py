@@ -83,6 +83,7 @@ class WorldModelTraining(WorldModelArchitecture):
             ("labelled", self.supervision == "none", "supervision none"),
             ("beta_dynamics", self.supervision == "none", "supervision none"),
             ("rarity", not self.beta_rgb, "beta_rgb 0"),
+            ("rgb_frames", not self.beta_rgb, "beta_rgb 0"),
         ):
             if idle and getattr(self, name) != getattr(type(self), name):
                 raise ValueError(f"{type(self).__name__}.{name} has no effect with {why}; leave it out")

@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 RECIPES = [path.relative_to(ROOT) for path in sorted((ROOT / "recipes").rglob("*.py"))]
 SETTINGS = [
     Path("dynmap_rl") / name
-    for name in ("training/settings.py", "data/settings.py", "evaluation/settings.py")
+    for name in ("training/settings.py", "data/settings.py", "evaluation/settings.py", "utils/devices.py")
 ]
 
 
