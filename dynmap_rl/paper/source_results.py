@@ -26,6 +26,15 @@ MEASURES = {  # name: text, and the sign with which it should rise with success
     "probe_velocity": ("R^2 of a linear map to the velocities", 1),
     "open_loop_mm": ("error after 2 s without frames (mm)", -1),
 }
+KINDS = {  # of sources, in the figure of measures: beginnings of their names
+    "simulator, with or without RGB loss": ("simulator", "informed"),
+    "none (Only-RGB)": ("none",),
+    "central": ("central",),
+    "savgol": ("savgol",),
+    "frames": ("centroid", "tracks", "flow"),
+    "5 to 50 % of the episodes": ("labelled",),
+    "commanded cart pose, with or without tracks": ("command",),
+}
 
 
 @torch.no_grad()
@@ -254,16 +263,17 @@ def plot_data(results: Path, task: str, path: Path) -> None:
 
 
 def plot_measures(results: Path, task: str, path: Path) -> None:
-    """Draw SR against each cheap measure, a colour for each source, with the rank correlation."""
+    """Draw SR against each cheap measure, a colour for each kind of source, with the rank correlation."""
     correlations = rank_correlations(results, task)
     figure, axes = plt.subplots(1, len(MEASURES), figsize=(11, 4.6), sharey=True, layout="constrained")
-    colors = dict(zip(SOURCES, plt.get_cmap("tab20").colors, strict=False))
     for axis, (measure, (text, _)) in zip(axes, MEASURES.items(), strict=True):
         title = []
         for policy, marker in zip(POLICIES, "os", strict=True):
             for x, y, name in zip(*measured_points(results, task, policy, measure), strict=True):
-                named = any(line.get_label() == SOURCES[name].text for line in axis.lines)
-                axis.plot(x, y, marker, ms=6, color=colors[name], label=None if named else SOURCES[name].text)
+                kind = next(kind for kind, names in KINDS.items() if name.startswith(names))
+                named = any(line.get_label() == kind for line in axis.lines)
+                color = f"C{list(KINDS).index(kind)}"
+                axis.plot(x, y, marker, ms=6, color=color, alpha=0.8, label=None if named else kind)
             if found := correlations.get(f"{policy}, {measure}"):
                 shape = {"o": "circles", "s": "squares"}[marker]
                 title.append(f"{policy} ({shape}): rank correlation {found['rho']:.2f}")
