@@ -142,7 +142,8 @@ def plot_conditions(results: list[dict], path: Path) -> None:
     """Draw success with its intervals at a few delays as dots.
 
     A panel has a line for each supervision and policy of a task, on stale frames and rolled forward, or for each
-    condition; of several runs of a supervision, a dot is of the last one. A panel with less than two lines is left out.
+    condition. Of several runs of a supervision, the one with the most conditions and delays is shown. A panel with less
+    than two lines is left out.
 
     Args:
         results: see :func:`read_delays`.
@@ -184,7 +185,7 @@ def _milliseconds(result: dict, steps: int | str) -> int:
 def _dots(results: list[dict]) -> dict[str, dict[str, dict[str, dict]]]:
     """Return the cells of each panel of dots, by their line and their marker."""
     panels = {}
-    for result in results:
+    for result in _choose_runs(results):
         task, row, policy, condition = (result[name] for name in ("task", "row", "policy", "condition"))
         if policy == "LeRobot" or condition == "past_actions":
             continue
@@ -199,6 +200,19 @@ def _dots(results: list[dict]) -> dict[str, dict[str, dict[str, dict]]]:
     return {
         title: panel if title.endswith("conditions") else _drop_rare(panel) for title, panel in panels.items()
     }
+
+
+def _choose_runs(results: list[dict]) -> list[dict]:
+    """Return the results of one run for each supervision and policy of a task, that with the most results and cells."""
+    rows = {}
+    for result in results:
+        runs = rows.setdefault((result["task"], result["row"], result["policy"]), {})
+        runs.setdefault(result["run"], []).append(result)
+    return [
+        result
+        for runs in rows.values()
+        for result in max(runs.values(), key=lambda found: (len(found), sum(len(r["cells"]) for r in found)))
+    ]
 
 
 def _drop_rare(panel: dict[str, dict[str, dict]]) -> dict[str, dict[str, dict]]:

@@ -63,6 +63,20 @@ def test_a_marker_of_one_supervision_is_left_out(tmp_path, monkeypatch):
     plt.close("all")
 
 
+def test_the_dots_of_a_line_are_of_one_run(tmp_path, monkeypatch):
+    saved = []
+    monkeypatch.setattr(delays, "save_figure", lambda figure, path: saved.append(figure))
+    stale, imagined = make_results(tmp_path)
+    others = [result | {"row": "Only-RGB"} for result in (stale, imagined)]
+    again = {steps: cell | {"SR": 1.0} for steps, cell in imagined["cells"].items()}
+    delays.plot_conditions(
+        [stale, imagined, *others, imagined | {"run": "x", "cells": again}], tmp_path / "f.png"
+    )
+    found = read_lines(saved[0].axes[0])
+    assert [rate for rate, _ in found["rolled forward, 500 ms"]] == [95, 95]
+    plt.close("all")
+
+
 def test_conditions_of_a_run_share_a_panel(tmp_path, monkeypatch):
     saved = []
     monkeypatch.setattr(delays, "save_figure", lambda figure, path: saved.append(figure))
