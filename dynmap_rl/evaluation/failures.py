@@ -42,6 +42,8 @@ def failure_causes(episodes: TensorDictBase, task: str) -> list[str | None]:
     goal, at rest or not. Tasks of one's own with cart and block, and those whose goal is not a point of two or three
     coordinates, have the cause "other".
 
+    Places and speeds are those before the last action, as a step has the state before its action.
+
     Args:
         episodes: result ``[E, T]`` of :func:`dynmap_rl.evaluation.roll_out`.
         task: name of the task, or ``module:Class``.

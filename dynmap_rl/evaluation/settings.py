@@ -17,7 +17,7 @@ class Evaluation:
     split: str = "test"
     # Scenes that every policy is evaluated on, the same for all; at most 1000.
     episodes: int = 1000
-    # Further scenes for each policy, 50 by the paper's protocol; 0 leaves them out.
+    # Further scenes, the same for every policy, 50 by the paper's protocol; 0 leaves them out.
     paper_episodes: int = 50
 
     def __post_init__(self):

@@ -109,14 +109,12 @@ def student_interval(rates: Sequence[float]) -> tuple[float, float] | None:
     Returns:
         The ends, within 0 and 100 %; None for fewer than two rates, or equal ones, which do not say how rates vary.
     """
-    from scipy.stats import t
+    from scipy.stats import ttest_1samp
 
-    count = len(rates)
-    if count < 2 or not np.ptp(rates):
+    if len(rates) < 2 or not np.ptp(rates):
         return None
-    mean = float(np.mean(rates))
-    half = float(t.ppf(0.975, count - 1)) * float(np.std(rates, ddof=1)) / count**0.5
-    return max(mean - half, 0.0), min(mean + half, 100.0)
+    found = ttest_1samp(rates, 0).confidence_interval()
+    return max(float(found.low), 0.0), min(float(found.high), 100.0)
 
 
 def welch_interval(rates_a: Sequence[float], rates_b: Sequence[float]) -> tuple[float, float] | None:

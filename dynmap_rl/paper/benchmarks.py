@@ -63,8 +63,8 @@ UPDATES = {  # of world models and policies, in the place of the defaults; chose
 PAGE = """# MuJoCo tasks
 
 Success in %, [95 % interval over the scenes], (success of each seed). The interval says nothing about further trainings, which
-differ by more. The numbers of updates of the RGB rows were chosen for each task on validation scenes, in single development runs
-that are not stored; those of End-to-End, ACT and Diffusion Policy are the recipes' defaults. On PlateSlide, plate and hand always
+differ by more. The numbers of updates of the decoupled rows were chosen for each task on validation scenes, in single development
+runs that are not stored; those of Joint, End-to-End, ACT and Diffusion Policy are the recipes' defaults. On PlateSlide, plate and hand always
 start in the same places: the goal, which policies are given, determines what to do, so that its column says nothing about
 perception. Derived dynamics (of the hand, tracked, hand and color) are explained in
 [dynmap_rl/data/README.md](../../../dynmap_rl/data/README.md#which-source). Tasks, cameras and experts are described in

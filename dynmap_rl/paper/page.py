@@ -65,16 +65,17 @@ The claims of the paper's Sec. V on success, drops and position errors are sets 
 1,000 scenes that both share. A gap is the difference of the two, in percentage points of SR or DR, or in mm of PE, with a
 95 % interval over the scenes and p: how often a gap at least as large would arise if there were no true one
 ([how](../../dynmap_rl/evaluation/statistics.py)). Both say nothing about further trainings. The 95 % interval over world models
-does: paired where both cells are of the same world models, otherwise Welch's. With three on either side it is wide. The paper's
-gaps are differences of its means over three policies.
+does: paired where both cells are of the same world models, otherwise Welch's. With three on either side it is wide. The
+interval over scenes is by bootstrap, and too narrow where few scenes differ; p is exact there. The paper's gaps are differences
+of its means over three policies.
 
 A comparison holds if p is below 0.05 and the interval over world models lies on the side that the claim says. It does not
-hold if that interval lies on the other side. Otherwise it is open. It is also open if one side has a single world model, or
-if all world models have the same rate. A claim holds if all of its comparisons hold. It does not hold if some do not and none
+hold if that interval lies on the other side. Otherwise it is open. If one side has the same rate with every world model, as
+at 100 %, the interval is that of the other side alone. If neither side varies, or one has a single world model, there is no
+interval, and the comparison is open. A claim holds if all of its comparisons hold. It does not hold if some do not and none
 holds; if some hold and some do not, it is mixed. Otherwise it is open. The paper's own gaps often have both signs. Single
 comparisons are not corrected for their number, and those with one and the same cell, such as Only-RGB, are no independent
-evidence. Where one side has the same rate with every world model, as at 100 %, the interval is that of the other side alone.
-Scenes of two tasks have nothing in common but their number; pairing them neither helps nor harms. "Recurrent policies gain
+evidence. Scenes of two tasks have nothing in common but their number; pairing them neither helps nor harms. "Recurrent policies gain
 less by dynamics" is a difference of differences: (recurrent - feed-forward) with dynamics, minus the same for Only-RGB.
 Decoupled runs were trained on a CPU, joint and end-to-end ones mostly on a GPU.
 
@@ -82,7 +83,7 @@ Comparisons are of the default encoder unless they name a plain CNN. With the de
 task 1, which leaves no room for gaps. The plain CNN is nearer to the paper, which has "a simple CNN-based encoder" and gives
 neither layers nor sizes; ours is trained with everything else that the default is trained with
 ([deviations](../README.md#choices-and-deviations-from-the-paper)). In the paper, Only-RGB with feed-forward policies fails by
-drops; with a plain CNN it fails by misses here, since demonstrations hardly move the block on the cart.
+drops; with a plain CNN it fails by misses here, possibly because demonstrations hardly move the block on the cart.
 
 {claims}
 
@@ -100,8 +101,8 @@ rests where no demonstration of task 1 goes:
 
 ## Every column
 
-SR and DR in %, PE in mm. By the paper's protocol: mean and standard deviation over all policies, 50 episodes each. On the
-test scenes: all policies of all world models on the same 1,000 scenes.
+SR and DR in %, PE in mm. By the paper's protocol: mean and standard deviation over all policies, on 50 scenes, the same
+for every policy, so that the deviation is that of the policies alone. On the test scenes: all policies of all world models on the same 1,000 scenes.
 
 Two intervals of 95 % stand in brackets. That over scenes is Wilson's for the effective number of independent episodes,
 since a scene that is hard for one policy is hard for the others. It says nothing about further trainings. That over world
@@ -124,9 +125,9 @@ policy; 95 % interval over scenes); and on held-out demonstrations, what stands 
 
 ## What fails
 
-Rows marked "all policies" count all policies of the world models whose results name causes. Rows marked "first policy" were run
-again with the first policy alone (`python recipes/paper/figures.py --only failures`), so that their rates differ from those of
-the cells. A drop is named after the place and the cart's speed
+Rows marked "all policies" count all policies of the world models whose results name causes. Rows marked "first policy" are
+of results that are older than the causes: failed episodes of the first policy of the world models that were still stored were
+run again (`python recipes/paper/figures.py --only failures`), so that their rates differ from those of the cells. A drop is named after the place and the cart's speed
 when the block began to tip; the causes are defined in [failures.py](../../dynmap_rl/evaluation/failures.py).
 
 {failures}

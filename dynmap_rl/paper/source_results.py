@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.stats import permutation_test, rankdata, spearmanr
+from scipy.stats import PermutationMethod, pearsonr, rankdata
 from tensordict import TensorDictBase
 
 from dynmap_rl.evaluation.probing import judge_states, probe
@@ -193,16 +193,9 @@ def rank_correlations(results: Path, task: str) -> dict[str, dict[str, float]]:
         for name in MEASURES:
             x, y, _ = measured_points(results, task, policy, name)
             if len(x) >= FEWEST:
-                ranks, others = rankdata(x), rankdata(y)
-                found = permutation_test(  # of paired ranks, the sum of products varies as their correlation does
-                    (ranks,), lambda r, axis=-1, others=others: (r * others).sum(axis),
-                    permutation_type="pairings", rng=np.random.default_rng(0),
-                )  # fmt: skip
-                numbers = {
-                    "rho": float(spearmanr(x, y).statistic),
-                    "p": float(found.pvalue),
-                    "sources": len(x),
-                }
+                random = PermutationMethod(rng=np.random.default_rng(0))
+                found = pearsonr(rankdata(x), rankdata(y), method=random)
+                numbers = {"rho": float(found.statistic), "p": float(found.pvalue), "sources": len(x)}
                 correlations[f"{policy}, {name}"] = numbers
     return correlations
 

@@ -26,5 +26,5 @@ def test_an_animation_lasts_as_long_as_its_episodes_and_ends_with_their_last_fra
     save_gif(shades.expand(1, steps, 3, 4, 4).contiguous(), tmp_path / "x.gif", dt, columns=1, scale=1)
     frames = list(ImageSequence.Iterator(Image.open(tmp_path / "x.gif")))
     seconds = sum(frame.info["duration"] for frame in frames) / 1000
-    assert seconds == pytest.approx(steps * dt, rel=0.3)  # a duration in a file is a multiple of 10 ms
+    assert seconds == pytest.approx(steps * dt, abs=0.025)  # a duration in a file is a multiple of 10 ms
     assert np.asarray(frames[-1].convert("L"), int)[0, 0] == pytest.approx(steps - 1, abs=2)
