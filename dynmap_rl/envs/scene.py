@@ -166,69 +166,6 @@ class ObstacleRanges(SceneRanges):
     With the expert's margin of 30 mm there is no way under it.
     """
 
-    obstacle_x: float = 0.5
-    obstacle_y: float = 0.38
-    obstacle_length: float = 0.22
-
-
-@dataclass(frozen=True)
-class BinScene(Scene):
-    """Scene of task 3: a bin with its inner width and depth; the middle of its opening is the goal."""
-
-    goal_y: float = 0.2
-    bin_width: float = 0.28
-    bin_depth: float = 0.12
-
-
-@dataclass(frozen=True)
-class SceneRanges:
-    """Uniform ranges from which a scene is drawn (units as in :class:`Scene`).
-
-    Start and goal are at least ``min_distance`` (m) apart, so that no episode starts as a success. By default objects
-    are darker than the background. The colours of cart and block differ by at least ``min_contrast`` (Euclidean
-    distance, 0..441), so that both are visible.
-
-    Attributes:
-        scene: class of the scenes that are drawn. A subclass with more factors has a range for each.
-
-    Raises:
-        ValueError: a range is not two finite numbers, the lower one first.
-    """
-
-    cart_width: Range = (0.20, 0.30)
-    cart_height: Range = (0.04, 0.04)
-    block_width: Range = (0.06, 0.06)
-    block_height: Range = (0.12, 0.20)
-    block_shift: Range = (-0.04, 0.04)
-    cart_x: Range = (0.18, 0.82)
-    cart_y: Range = (0.08, 0.68)
-    goal_x: Range = (0.18, 0.82)
-    goal_y: Range = (0.08, 0.68)
-    friction: Range = (0.8, 0.8)
-    density: Range = (100.0, 100.0)
-    object_color: Range = (0, 140)
-    background_color: Range = (180, 255)
-    min_distance: float = 0.2
-    min_contrast: float = 60.0
-
-    scene: ClassVar[type[Scene]] = Scene
-
-    def __post_init__(self):
-        for name, value in vars(self).items():
-            if name.startswith("min_"):
-                continue
-            if np.shape(value) != (2,) or not np.isfinite(value).all() or value[0] > value[1]:
-                raise ValueError(
-                    f"{name} of the ranges must be two finite numbers, the lower one first, got {value!r}"
-                )
-
-
-@dataclass(frozen=True)
-class ObstacleRanges(SceneRanges):
-    """Ranges of task 2: the obstacle stands in the centre of starts and goals. There is no way under it with
-    the expert's margin of 30 mm.
-    """
-
     obstacle_x: Range = (0.5, 0.5)
     obstacle_y: Range = (0.38, 0.38)
     obstacle_length: Range = (0.22, 0.22)
