@@ -12,13 +12,28 @@ ELONGATED = 1.3  # length to width of an object whose longest axis is known
 def align_turns(angle: np.ndarray, rows: list[slice], period: float) -> None:
     """Shift episodes of unwrapped angles ``[N, D]`` in place by whole turns, so that a pose has one value in all of them.
 
-    The mean of each episode is moved to within half a turn of the mean direction of all.
+    The circle is cut in the middle of the widest range of directions that no episode passes, and every episode is moved to
+    the same side of the cut. Where together they go all the way round, this is done with their first steps alone. As many
+    episodes as possible stay where they are.
     """
-    from scipy.stats import circmean
+    for column in angle.T:
+        first = np.array([column[own][0] for own in rows])
+        low, high = (np.array([end(column[own]) for own in rows]) for end in (np.min, np.max))
+        cut = _cut(low, high, period)
+        turns = np.floor((first - (_cut(first, first, period) if cut is None else cut)) / period)
+        for own, turn in zip(rows, turns - np.median(turns).round(), strict=True):
+            column[own] -= period * turn
 
-    center = circmean(angle, period / 2, -period / 2, axis=0)
-    for own in rows:
-        angle[own] -= period * np.round((angle[own].mean(0) - center) / period)
+
+def _cut(low: np.ndarray, high: np.ndarray, period: float) -> float | None:
+    """Return the middle of the widest gap between arcs of a circle, or None if they leave none."""
+    order = np.argsort(low % period)
+    start = (low % period)[order]
+    end = start + (high - low)[order]
+    reached = np.maximum.accumulate([end.max() - period, *end[:-1]])
+    widest = (start - reached).argmax()
+    gap = start[widest] - reached[widest]
+    return start[widest] - gap / 2 if gap > 0 else None
 
 
 def align_axes(angle: np.ndarray, episodes: list[tuple[slice, Motion]]) -> None:

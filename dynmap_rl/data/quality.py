@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from .motion import Motion
 
 EXPLAINED = 0.25  # share of the variance of colours that remains where objects have only changed places
 SMOOTH = 7, 2  # window and order of the smooth trajectory
+RESTS = 0.1  # extent of an object that rests in an episode, as a share of the mean
 
 # name: (limit, whether larger is worse, what is measured, advice)
 LIMITS = {
@@ -44,9 +46,10 @@ LIMITS = {
         "film at a higher frame rate, or move more slowly",
     ),
     "jumps": (
-        0.005, True, "share of the steps in which a position jumps by more than a quarter of its extent",
-        "look at the frames there: the track has gone to another object, or the sensor failed; name an angle of a state that "
-        "jumps by its period in --angles, and leave an entry that hardly moves out of --columns",
+        0.02, True, "share of the episodes in which a position jumps by more than a quarter of its extent in one step",
+        "look at the frames there: the track has gone to another object, or the sensor failed, and all that follows may be "
+        "wrong; name an angle of a state that jumps by its period in --angles, leave an entry that hardly moves out of "
+        "--columns, or delete these episodes (lerobot-edit-dataset)",
     ),
     "residual": (
         0.02, True, "distance from a smooth trajectory, root mean square, as a share of the extent of the motion",
@@ -100,16 +103,11 @@ def judge_quality(derived: Sequence[Derived]) -> dict:
         ``good``, ``where`` (that object or entry), ``episode`` (the worst one), ``what`` and ``advice``.
     """
     rows: dict[int, dict] = {}  # values by check and place, by episode
-    # Of each entry of a state, by episode: entries may have different units.
-    extents: dict[str, list[float]] = {}
-    for part in derived:
-        if part.motion.found is None:
-            for name, extent in zip(part.names, _extent(part.position), strict=True):
-                extents.setdefault(name, []).append(extent)
-    means = {name: float(np.mean(values)) for name, values in extents.items()}
+    steps = {part.episode: len(part.position) for part in derived}
+    extents = _extents(derived)
     for part in derived:
         row = rows.setdefault(part.episode, {})
-        for name, values in _measure(part, means).items():
+        for name, values in _measure(part, extents).items():
             row.setdefault(name, {}).update(values)
     tracked = [part for part in derived if part.motion.tracks and part.motion.found.shape[1] > 1]
     for part, swapped in zip(tracked, _swapped([part.motion.tracks.color for part in tracked]), strict=True):
@@ -120,7 +118,8 @@ def judge_quality(derived: Sequence[Derived]) -> dict:
         if not found:
             continue
         sign = 1 if more else -1
-        join = np.max if name == "gone" else np.mean
+        weights = [1 if name in ("jumps", "order") else steps[e] for e, row in rows.items() if row.get(name)]
+        join = np.max if name == "gone" else partial(np.average, weights=weights)
         means = {where: float(join([row[where] for row in found])) for where in found[0]}
         where = max(means, key=lambda key, means=means, sign=sign: sign * means[key])
         worst = max(
@@ -157,18 +156,34 @@ def quality_text(quality: dict) -> str:
     return "\n".join(lines)
 
 
+def _extents(derived: Sequence[Derived]) -> dict[str, float]:
+    """Return the mean extent of every entry over the episodes, without the switches.
+
+    Entries of a state may have different units; those that are found in the frames have one, and share the largest. A
+    switch is an entry with two values, such as a gripper that is open or closed, which may jump.
+    """
+    extents, values = {}, {}
+    for part in derived:
+        extent, motion = _extent(part.position), part.motion
+        if motion.found is not None:
+            extent[:] = np.delete(extent, motion.angles).max(initial=0.0)
+        for name, own, column in zip(part.names, extent, part.position.T, strict=True):
+            extents.setdefault(name, []).append(own)
+            values[name] = np.unique([*values.get(name, ()), *column])[:3]
+    return {name: float(np.mean(some)) for name, some in extents.items() if len(values[name]) > 2}
+
+
 def _measure(episode: Derived, extents: dict[str, float]) -> dict[str, dict[str, float]]:
-    """Return every measure of an episode by object or entry, given the mean extents of a state's entries."""
+    """Return every measure of an episode by object or entry, given the mean extents of the entries."""
     names, position, motion = episode.names, episode.position, episode.motion
-    lines = [i for i in range(position.shape[1]) if i not in motion.angles]
-    shared = _extent(position)[lines].max(initial=0.0)  # of entries that are found in the frames
-    extent = np.maximum([extents.get(name, shared) for name in names], 1e-9)
+    lines = [i for i, name in enumerate(names) if i not in motion.angles and name in extents]
+    extent = np.maximum([extents.get(name, 0.0) for name in names], 1e-9)
     rest = position - _smooth(position)
     rms = np.sqrt(np.square(rest).mean(0))
     result = {
         "residual": {names[i]: rms[i] / extent[i] for i in lines},
         "residual_angle": {names[i]: rms[i] * 2 * np.pi / motion.period for i in motion.angles},
-        "jumps": {names[i]: _jumps(position[:, i], extent[i]) for i in lines},
+        "jumps": {names[i]: float(_jumps(position[:, i], extent[i])) for i in lines},
     }
     if motion.found is not None:
         bodies = _bodies(names, motion.found.shape[1])
@@ -183,12 +198,11 @@ def _measure(episode: Derived, extents: dict[str, float]) -> dict[str, dict[str,
     result["background"] = {"picture": tracks.moving}
     if motion.other is not None:
         entries = position.shape[1] // len(bodies)
-        result["agreement"] = {
-            body: _correlation(
-                *(v[:, entries * n : entries * n + 2] for v in (episode.velocity, motion.other))
-            )
-            for n, body in enumerate(bodies)
-        }
+        for n, body in enumerate(bodies):
+            own = slice(entries * n, entries * n + 2)
+            rests = _extent(position[:, own]).max() < RESTS * extent[own].max()
+            agreement = 1.0 if rests else _correlation(episode.velocity[:, own], motion.other[:, own])
+            result.setdefault("agreement", {})[body] = agreement
     return result
 
 
@@ -232,12 +246,12 @@ def _smooth(position: np.ndarray) -> np.ndarray:
     return savgol_filter(position, window, order, axis=0) if len(position) >= window else position
 
 
-def _jumps(values: np.ndarray, extent: float) -> float:
-    """Return the share of the steps that are larger than a quarter of the extent and three times their neighbours."""
+def _jumps(values: np.ndarray, extent: float) -> bool:
+    """Return whether a step is larger than a quarter of the extent and three times its neighbours."""
     from scipy.ndimage import median_filter
 
     step = np.abs(np.diff(values))
-    return float(((step > 0.25 * extent) & (step > 3 * median_filter(step, 7))).mean())
+    return bool(((step > 0.25 * extent) & (step > 3 * median_filter(step, 7))).any())
 
 
 def _correlation(a: np.ndarray, b: np.ndarray) -> float:

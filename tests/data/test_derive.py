@@ -41,11 +41,25 @@ def test_a_pose_has_one_angle_in_all_episodes():
     rows = [slice(0, 20), slice(20, 40), slice(40, 60)]
     angle = np.concatenate([np.unwrap((true[r] + np.pi) % (2 * np.pi) - np.pi) for r in rows])
     assert np.ptp(angle - true) > 6
-    align_turns(angle, rows, 2 * np.pi)
+    align_turns(angle[:, None], rows, 2 * np.pi)
     assert np.ptp(angle - true) < 1e-9
-    degrees = np.array([-170.0, 170.0])
+    degrees = np.array([[-170.0], [170.0]])
     align_turns(degrees, [slice(0, 1), slice(1, 2)], 360.0)
     assert np.ptp(degrees) == pytest.approx(20)
+
+
+def test_a_joint_within_its_limits_stays_as_measured():
+    """An episode whose mean is far from that of the others."""
+    angle = np.concatenate([np.linspace(-2.7, 2.7, 50), *[np.linspace(1.5, 2.6, 20)] * 3, np.full(20, -2.4)])
+    rows, found = [slice(0, 50), *(slice(50 + 20 * i, 70 + 20 * i) for i in range(4))], angle[:, None].copy()
+    align_turns(found, rows, 2 * np.pi)
+    np.testing.assert_array_equal(found[:, 0], angle)
+
+
+def test_episodes_that_together_go_all_the_way_round_agree_where_they_begin():
+    angle = np.concatenate([np.linspace(0, 3.5, 20), 2 * np.pi + np.linspace(0.1, -3.5, 20)])[:, None]
+    align_turns(angle, [slice(0, 20), slice(20, 40)], 2 * np.pi)
+    assert angle[20, 0] - angle[0, 0] == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize(
