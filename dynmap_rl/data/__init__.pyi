@@ -2,8 +2,8 @@ from .augmentation import augment as augment
 from .demonstrations import load_dataset as load_dataset
 from .demonstrations import load_demonstrations as load_demonstrations
 from .demonstrations import load_meta as load_meta
+from .derivatives import differentiate as differentiate
 from .derive import add_dynamics as add_dynamics
-from .derive import differentiate as differentiate
 from .features import compute_features as compute_features
 from .format.frames import join_views as join_views
 from .format.hub import push_dataset as push_dataset

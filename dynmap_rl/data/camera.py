@@ -14,6 +14,7 @@ from dynmap_rl.envs.task import BODIES
 
 from .flow import flow_velocity
 from .format.frames import choose_camera, iterate_frames
+from .format.reading import read_column, read_table, spans
 from .motion import Motion
 from .tracking import SORTS, WIDEST, Tracks, track_centroid, track_objects
 
@@ -142,16 +143,19 @@ def read_motion(root: Path, info: dict, camera: FrameSource) -> Iterator[tuple[i
     Raises:
         ValueError: a file is damaged, or what should be tracked is not found; the message names the episode.
     """
-    fps, failed = info.get("fps") or 1, {}
+    table, failed = read_table(root, info, ["timestamp"]), {}
+    time = read_column(root, info, table, "timestamp", np.float64).numpy()[:, 0]
+    rows = dict(spans(table["episode_index"].to_numpy()))
     episodes = iterate_frames(root, info, camera.column, widest=WIDEST)
     for episode, frames, factor in tqdm(episodes, "tracking", info.get("total_episodes"), leave=False):
         try:
-            yield episode, measure(frames, factor, camera, fps)
+            yield episode, measure(frames, factor, camera, time[rows[episode]])
         except ValueError as error:
             failed.setdefault(str(error), []).append(episode)
     if failed:
         raise ValueError(
-            f"{root}: {'; '.join(f'in {_name_episodes(e)} {text}' for text, e in failed.items())}"
+            f"{root}: {'; '.join(f'in {_name_episodes(e)} {text}' for text, e in failed.items())}; or delete these "
+            "episodes (lerobot-edit-dataset)"
         )
 
 
@@ -160,14 +164,14 @@ def _name_episodes(episodes: list[int]) -> str:
     return f"episode{'s' * (len(episodes) > 1)} {', '.join(map(str, episodes))}"
 
 
-def measure(frames: np.ndarray, factor: Sequence[float], camera: FrameSource, fps: float) -> Motion:
+def measure(frames: np.ndarray, factor: Sequence[float], camera: FrameSource, time: np.ndarray) -> Motion:
     """Measure the motion in one episode.
 
     Args:
         frames: uint8 ``[T, height, width, 3]``.
         factor: ratios of the full width and height to those of the frames, ``[2]``.
         camera: source and its settings.
-        fps: frames per second.
+        time: times of the frames ``[T]`` (s).
 
     Raises:
         ValueError: what should be tracked is not found. The message is the end of a sentence.
@@ -179,7 +183,7 @@ def measure(frames: np.ndarray, factor: Sequence[float], camera: FrameSource, fp
         return Motion(place(centroid), [], found=found[:, None])
     tracks = track(frames, camera)
     position = place(tracks.pose[..., :size]).reshape(count, -1)
-    flow = (flow_velocity(frames, tracks)[..., :size] * scale * fps).reshape(count, -1)
+    flow = (flow_velocity(frames, tracks, time)[..., :size] * scale).reshape(count, -1)
     angles = [] if camera.point else list(range(2, position.shape[1], 3))
     used = {"velocity" if camera.source == "flow" else "other": flow}
     return Motion(position, angles, found=tracks.found, tracks=tracks, **used)

@@ -17,60 +17,15 @@ from dynmap_rl.keys import DYNAMICS, FOUND
 from .angles import align_axes, align_turns
 from .camera import FrameSource, choose_view, read_motion
 from .demonstrations import DERIVED, META, find_layout, find_meta
-from .format.columns import write_columns
+from .derivatives import check_method, differentiate
+from .format.columns import new_folder, write_columns
 from .format.reading import find_dataset, read_column, read_info, read_table, spans
 from .motion import Motion
 from .normalization import planar_range, value_range
 from .quality import Derived, judge_quality
 from .state import choose_state, read_state
 
-METHODS = ("central", "savgol")
 SOURCES = "state", "centroid", "tracks", "flow", "state,tracks", "state,flow"
-
-
-def differentiate(
-    position: np.ndarray, time: np.ndarray, method: str = "central", window: int = 11, order: int = 3
-) -> tuple[np.ndarray, np.ndarray]:
-    """Compute velocity and acceleration from positions.
-
-    Both methods use later steps: the results are labels, and no policy may read them.
-
-    Args:
-        position: positions ``[T, D]`` of one episode, float64.
-        time: their times ``[T]`` (s).
-        method: ``central`` (differences over both neighbours by ``numpy.gradient``, of second order at uneven times
-            too, twice for the acceleration) or ``savgol`` (derivatives of a polynomial fitted to each window, for noisy
-            positions at even times).
-        window: steps of the window of ``savgol``.
-        order: order of the polynomial of ``savgol``.
-
-    Returns:
-        Velocity and acceleration ``[T, D]``, per s and per s^2, float64.
-
-    Raises:
-        ValueError: there are too few steps, or times do not increase or, for ``savgol``, are not uniform. The message
-            is the end of a sentence.
-    """
-    from scipy.signal import savgol_filter
-
-    steps = np.diff(time)
-    needed = window if method == "savgol" else 3
-    if len(position) < needed:
-        raise ValueError(f"must have at least {needed} steps for --method {method}, got {len(position)}")
-    if not (steps > 0).all():
-        raise ValueError("must have timestamps that increase")
-    if method == "central":
-        velocity = np.gradient(position, time, axis=0, edge_order=2)
-        return velocity, np.gradient(velocity, time, axis=0, edge_order=2)
-    mean = (time[-1] - time[0]) / (len(time) - 1)
-    # Timestamps are stored as float32: they are as uniform as its precision allows.
-    if np.abs(steps - mean).max() > 0.01 * mean + 2 * np.spacing(np.float32(time[-1])):
-        raise ValueError(
-            f"must have uniform timestamps for --method savgol, got distances of {steps.min():.4g} to "
-            f"{steps.max():.4g} s; use --method central"
-        )
-    velocity, acceleration = (savgol_filter(position, window, order, k, mean, axis=0) for k in (1, 2))
-    return velocity, acceleration
 
 
 def add_dynamics(
@@ -118,7 +73,7 @@ def add_dynamics(
             unit.
         angle_noise: likewise of the angles.
         noise_seed: seed of the noise.
-        method: ``central`` or ``savgol`` (see :func:`differentiate`); by default central for a state, savgol for frames.
+        method: ``central`` or ``savgol`` (see :func:`dynmap_rl.data.differentiate`); by default central for a state, savgol for frames.
         window: steps of the window of ``savgol``.
         order: order of the polynomial of ``savgol``.
         camera: column of the frames; by default the first camera.
@@ -147,7 +102,7 @@ def add_dynamics(
     _check_output(root, output)
     if source not in SOURCES:
         raise ValueError(f"--source must be one of {', '.join(map(repr, SOURCES))}, got {source!r}")
-    _check_method(method or ("central" if source == "state" else "savgol"), window, order)
+    check_method(method or ("central" if source == "state" else "savgol"), window, order)
     planar = meta is not None and _is_planar(meta["task"])
     parts, entries, view = [], None, None  # names, motions by episode, and method
     if "state" in source:
@@ -170,44 +125,63 @@ def add_dynamics(
     table = read_table(root, info, ["timestamp", *old])
     time = read_column(root, info, table, "timestamp", np.float64).numpy()[:, 0]
     rows = dict(spans(table["episode_index"].to_numpy()))
-    _check_lengths(root, rows, [part[2] for part in parts], window)
-    values, derived, start = {q: np.empty((len(table), len(names))) for q in DYNAMICS}, [], 0
-    seen = np.ones((len(table), len(names)), dtype=bool)
-    for own_names, motions, own_method in parts:
-        own, first = slice(start, start := start + len(own_names)), len(derived)
+    _check_times(root, time, rows, [part[2] for part in parts], window)
+    with new_folder(output) as folder:
+        values, seen, derived = _derive_parts(root, parts, time, rows, window, order)
+        new = {f"dynamics.{q}": v.astype(np.float32) for q, v in values.items()}
+        if view or FOUND in info["features"]:
+            new[FOUND] = seen
+        differences = {}
+        for name in old:
+            quantity = name.removeprefix("dynamics.")
+            with contextlib.suppress(ValueError):  # damaged columns may be replaced too
+                before = read_column(root, info, table, name, np.float64).numpy()
+                if before.shape == values[quantity].shape:
+                    differences[quantity] = np.abs(values[quantity] - before).mean(0)
+        quality = judge_quality(derived)
+        how = {"source": source, "methods": [part[2] for part in parts], "window": window, "order": order}
+        how |= {"state": entries and dataclasses.asdict(entries), "frames": view and dataclasses.asdict(view)}
+        how |= quality | {"differences": {q: d.tolist() for q, d in differences.items()}}
+        meta = _describe(meta, planar, names, values, rows) if meta else None
+        write_columns(root, folder, info, table, new, names, {META: meta, DERIVED: how})
+    return {"differences": differences, "quality": quality, "view": view}
+
+
+def _derive_parts(
+    root: Path, parts: list, time: np.ndarray, rows: dict[int, slice], window: int, order: int
+) -> tuple[dict[str, np.ndarray], np.ndarray, list[Derived]]:
+    """Return the values ``[N, D]`` by quantity, whether they were found, and what is judged.
+
+    Args:
+        root: folder of the dataset, for messages.
+        parts: names of the entries, motions by episode, and method of every source.
+        time: timestamps ``[N]``.
+        rows: rows of every episode.
+        window: see :func:`dynmap_rl.data.differentiate`.
+        order: see :func:`dynmap_rl.data.differentiate`.
+    """
+    shape = len(time), sum(len(names) for names, _, _ in parts)
+    values, seen = {quantity: np.empty(shape) for quantity in DYNAMICS}, np.ones(shape, dtype=bool)
+    derived, start = [], 0
+    for names, motions, method in parts:
+        own, first = slice(start, start := start + len(names)), len(derived)
         for episode, motion in motions:
             try:
-                found, motion = _derive(motion, time[rows[episode]], own_method, window, order)
+                found, motion = _derive(motion, time[rows[episode]], method, window, order)
             except ValueError as error:
                 raise ValueError(f"{root}: episode {episode} {error}") from error
             for quantity, part in found.items():
                 values[quantity][rows[episode], own] = part
             if motion.found is not None:
-                seen[rows[episode], own] = motion.found.repeat(len(own_names) // motion.found.shape[1], 1)
-            derived.append(Derived(episode, own_names, found["position"], found["velocity"], motion))
+                seen[rows[episode], own] = motion.found.repeat(len(names) // motion.found.shape[1], 1)
+            derived.append(Derived(episode, names, found["position"], found["velocity"], motion))
         angle = values["position"][:, own][:, motion.angles]
         if motion.tracks:
             align_axes(angle, [(rows[part.episode], part.motion) for part in derived[first:]])
         else:
             align_turns(angle, list(rows.values()), motion.period)
         values["position"][:, own][:, motion.angles] = angle
-    new = {f"dynamics.{q}": v.astype(np.float32) for q, v in values.items()}
-    if view or FOUND in info["features"]:
-        new[FOUND] = seen
-    meta = _describe(meta, planar, names, values, rows) if meta else None
-    differences = {}
-    for name in old:
-        quantity = name.removeprefix("dynamics.")
-        with contextlib.suppress(ValueError):  # damaged columns may be replaced too
-            before = read_column(root, info, table, name, np.float64).numpy()
-            if before.shape == values[quantity].shape:
-                differences[quantity] = np.abs(values[quantity] - before).mean(0)
-    quality = judge_quality(derived)
-    how = {"source": source, "methods": [part[2] for part in parts], "window": window, "order": order}
-    how |= {"state": entries and dataclasses.asdict(entries), "frames": view and dataclasses.asdict(view)}
-    how |= quality | {"differences": {q: d.tolist() for q, d in differences.items()}}
-    write_columns(root, output, info, table, new, names, {META: meta, DERIVED: how})
-    return {"differences": differences, "quality": quality, "view": view}
+    return values, seen, derived
 
 
 def _derive(
@@ -224,7 +198,9 @@ def _derive(
     return {"position": position, "velocity": velocity, "acceleration": acceleration}, motion.light()
 
 
-def _check_lengths(root: Path, rows: dict[int, slice], methods: list[str], window: int) -> None:
+def _check_times(
+    root: Path, time: np.ndarray, rows: dict[int, slice], methods: list[str], window: int
+) -> None:
     needed = window if "savgol" in methods else 3
     lengths = {episode: own.stop - own.start for episode, own in rows.items()}
     if short := [f"{episode} ({length} steps)" for episode, length in lengths.items() if length < needed]:
@@ -232,6 +208,11 @@ def _check_lengths(root: Path, rows: dict[int, slice], methods: list[str], windo
         raise ValueError(
             f"{root} must have at least {needed} steps in every episode, got fewer in {', '.join(short)}; {shorter}delete "
             "these episodes (lerobot-edit-dataset)"
+        )
+    if unordered := [str(episode) for episode, own in rows.items() if (np.diff(time[own]) <= 0).any()]:
+        raise ValueError(
+            f"{root} must have timestamps that increase, got others in the episodes {', '.join(unordered)}; delete these "
+            "(lerobot-edit-dataset), or correct the column timestamp"
         )
 
 
@@ -265,12 +246,3 @@ def _check_output(root: Path, output: Path) -> None:
         )
     if output.resolve().is_relative_to(root.resolve()):
         raise ValueError(f"--output must be outside of the dataset, got {output}; choose another")
-
-
-def _check_method(method: str, window: int, order: int) -> None:
-    if method not in METHODS:
-        raise ValueError(f"--method must be one of {', '.join(METHODS)}, got {method!r}")
-    if method == "savgol" and not (window % 2 and 2 <= order < window):
-        raise ValueError(
-            f"--window must be odd and --order at least 2 and below --window, got {window} and {order}"
-        )

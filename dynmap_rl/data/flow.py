@@ -18,19 +18,20 @@ FARNEBACK = {  # names of OpenCV; no pyramid reduction below 32 pixels is of use
 }
 
 
-def flow_velocity(frames: np.ndarray, tracks: Tracks) -> np.ndarray:
+def flow_velocity(frames: np.ndarray, tracks: Tracks, time: np.ndarray) -> np.ndarray:
     """Compute the velocity of every object from the flow between neighbouring frames.
 
     The flow is Farneback's (``cv2.calcOpticalFlowFarneback``). A rigid motion is fitted to the flow of an object's
     pixels, weighted by the gradient of the picture, since the flow of a plain surface is not observed. The velocity of
-    a frame is the mean of the motions before and after it.
+    a frame is the mean of those before and after it.
 
     Args:
         frames: frames of one episode, uint8 ``[T, height, width, 3]``.
         tracks: objects in these frames.
+        time: times of the frames ``[T]`` (s).
 
     Returns:
-        ``[T, N, 3]``, the change of x, y (pixels) and angle (rad) per frame. Where an object is not found, it is
+        ``[T, N, 3]``, the change of x, y (pixels) and angle (rad) per s. Where an object is not found, it is
         interpolated.
     """
     count = tracks.pose.shape[1]
@@ -41,6 +42,7 @@ def flow_velocity(frames: np.ndarray, tracks: Tracks) -> np.ndarray:
         gradient = np.hypot(cv2.Sobel(gray[t], cv2.CV_32F, 1, 0), cv2.Sobel(gray[t], cv2.CV_32F, 0, 1))
         for n in range(count):
             step[n] = _rigid(flow, gradient, tracks.labels[t] == n + 1, tracks.pose[t, n])
+    steps /= np.diff(time)[:, None, None]
     both = tracks.found[:-1] & tracks.found[1:]
     for n in range(count):
         if both[:, n].any():

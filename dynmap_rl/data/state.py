@@ -74,6 +74,7 @@ def choose_state(
     columns = list(range(size) if columns is None else columns)
     if not columns or len(set(columns)) < len(columns) or not all(0 <= i < size for i in columns):
         raise ValueError(f"--columns must be different entries of {column}, 0 to {size - 1}, got {columns}")
+    angles = list(angles)
     if unknown := [i for i in angles if i not in columns]:
         raise ValueError(f"--angles must be among --columns {columns}, got {unknown}")
     names, places = entry_names(info, column), [columns.index(i) for i in angles]

@@ -8,6 +8,8 @@ from dynmap_rl.data.camera import FrameSource, measure
 from dynmap_rl.data.flow import flow_velocity
 from dynmap_rl.data.tracking import track_objects
 
+TIME = np.arange(10) / 20
+
 
 @pytest.fixture(scope="module")
 def frames():
@@ -23,10 +25,10 @@ def frames():
 )
 def test_the_unit_is_that_of_the_camera(frames, width, scale, origin):
     tracks, flow = track_objects(frames, 2), FrameSource("flow", "front", 2, width=width)
-    motion = measure(frames, (2, 2), flow, fps=20)
+    motion = measure(frames, (2, 2), flow, TIME)
     np.testing.assert_allclose(motion.position, (tracks.pose * scale + origin).reshape(10, 6))
     np.testing.assert_allclose(
-        motion.velocity, (flow_velocity(frames, tracks) * scale * 20).reshape(10, 6), atol=1e-12
+        motion.velocity, (flow_velocity(frames, tracks, TIME) * scale).reshape(10, 6), atol=1e-12
     )
     assert motion.angles == [2, 5] and motion.other is None
 
@@ -35,7 +37,7 @@ def test_the_unit_is_that_of_the_camera(frames, width, scale, origin):
 def test_pixels_need_not_be_reduced_alike_in_both_directions(frames, width):
     """A picture of 424 x 240 pixels becomes one of 160 x 91."""
     square, other = (
-        measure(frames, factor, FrameSource("centroid", "front", width=width), 20).position
+        measure(frames, factor, FrameSource("centroid", "front", width=width), TIME).position
         for factor in ((2.65, 2.65), (2.65, 240 / 91))
     )
     np.testing.assert_allclose(other[:, 0], square[:, 0])

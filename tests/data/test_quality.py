@@ -8,17 +8,18 @@ from films import film, make_poses
 from robot_dataset import make_robot_dataset
 
 from dynmap_rl.data.camera import FrameSource, measure, read_motion
-from dynmap_rl.data.derive import differentiate
+from dynmap_rl.data.derivatives import differentiate
 from dynmap_rl.data.format.reading import read_info
 from dynmap_rl.data.motion import Motion
 from dynmap_rl.data.quality import LIMITS, Derived, judge_quality, quality_text, worst_episode
 
 NAMES = ["low_x", "low_y", "low_theta", "high_x", "high_y", "high_theta"]
 POSES = make_poses(120)
+TIME = np.arange(120) / 20
 
 
 def judge(frames, objects=2):
-    motion = measure(frames, (1, 1), FrameSource("tracks", "front", objects), 20)
+    motion = measure(frames, (1, 1), FrameSource("tracks", "front", objects), np.arange(len(frames)) / 20)
     velocity, _ = differentiate(motion.position, np.arange(len(frames)) / 20, "savgol")
     return judge_quality([Derived(7, NAMES[: 3 * objects], motion.position, velocity, motion)])
 
@@ -68,7 +69,7 @@ def test_a_fault_of_a_film_is_found_with_its_place(fault):
 def judge_order(films):
     parts = []
     for episode, frames in enumerate(films):
-        motion = measure(frames, (1, 1), FrameSource("tracks", "front", 2), 20)
+        motion = measure(frames, (1, 1), FrameSource("tracks", "front", 2), TIME)
         velocity, _ = differentiate(motion.position, np.arange(len(frames)) / 20, "savgol")
         parts.append(Derived(episode, NAMES, motion.position, velocity, motion.light()))
     return judge_quality(parts)["checks"]["order"]
@@ -153,7 +154,7 @@ def test_shares_of_frames_count_every_frame_alike():
 
 
 def test_a_tracked_object_that_rests_in_one_episode_is_no_fault():
-    motion = measure(film(POSES), (1, 1), FrameSource("tracks", "front", 2), 20)
+    motion = measure(film(POSES), (1, 1), FrameSource("tracks", "front", 2), TIME)
     rng, parts = np.random.default_rng(0), []
     for episode in range(5):
         position, velocity = motion.position.copy(), np.gradient(motion.position, 1 / 20, axis=0)
@@ -173,7 +174,7 @@ def test_a_position_that_moves_far_in_every_step_does_not_jump():
 
 def test_the_flow_of_every_object_is_compared_with_its_own_velocity():
     velocity = np.gradient(POSES.reshape(120, 6), axis=0)
-    motion = measure(film(POSES), (1, 1), FrameSource("tracks", "front", 2), 20)
+    motion = measure(film(POSES), (1, 1), FrameSource("tracks", "front", 2), TIME)
     motion = replace(motion, other=velocity * [1, 1, 1, -1, -1, 1])
     quality = judge_quality([Derived(7, NAMES, motion.position, velocity, motion)])
     check = quality["checks"]["agreement"]

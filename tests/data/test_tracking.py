@@ -60,7 +60,9 @@ def test_objects_are_found_with_their_angles_also_where_they_rest(extent, noise)
 def test_velocities_by_flow_are_those_of_the_motion():
     poses = make_poses(120)
     frames = film(poses, SIZE)
-    velocity, expected = flow_velocity(frames, track_objects(frames, 2)), np.gradient(truth(poses), axis=0)
+    time = np.cumsum(np.tile([0.04, 0.06], 60))  # uneven
+    velocity = flow_velocity(frames, track_objects(frames, 2), time)
+    expected = np.gradient(truth(poses), time, axis=0)
     for n in range(2):
         assert np.corrcoef(velocity[:, n, 0], expected[:, n, 0])[0, 1] > 0.9
         assert np.corrcoef(velocity[:, n, 2], expected[:, n, 2])[0, 1] > 0.2
@@ -75,7 +77,10 @@ def test_velocities_by_flow_do_not_read_a_second_region_of_the_colour():
         frame[60 - t : 68 - t, 84:92] = COLORS[1]
     tracks = [track_objects(frames, colors=[COLORS[1]]) for frames in (alone, both)]
     assert np.array_equal(tracks[0].labels, tracks[1].labels)
-    np.testing.assert_allclose(flow_velocity(alone, tracks[0]), flow_velocity(both, tracks[1]), atol=0.1)
+    np.testing.assert_allclose(
+        *(flow_velocity(f, t, np.arange(len(f))) for f, t in zip((alone, both), tracks, strict=True)),
+        atol=0.1,
+    )
 
 
 def test_an_object_that_is_hidden_is_interpolated():
@@ -89,7 +94,7 @@ def test_an_object_that_is_hidden_is_interpolated():
     assert tracks.found[:, 0].all() and np.flatnonzero(~tracks.found[:, 1]).tolist() == list(range(20, 25))
     assert not tracks.area[hidden, 1].any()
     assert np.abs(tracks.pose - truth(poses))[hidden, :, :2].max() < 3
-    velocity = flow_velocity(frames, tracks)[:, 1]
+    velocity = flow_velocity(frames, tracks, np.arange(len(frames)))[:, 1]
     np.testing.assert_allclose(np.diff(velocity[20:25], 2, axis=0), 0, atol=1e-9)
     assert velocity[20:25, 0].min() > 0.1
 

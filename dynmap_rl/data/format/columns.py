@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +22,40 @@ from .quiet import quiet
 from .reading import spans
 
 
+@contextmanager
+def new_folder(output: Path) -> Iterator[Path]:
+    """Give a folder beside ``output`` that becomes it at the end of the block; after an error or Ctrl-C nothing is left.
+
+    Args:
+        output: the new folder.
+
+    Raises:
+        ValueError: another process is writing it.
+        OSError: it cannot be written.
+    """
+    from filelock import FileLock, Timeout
+
+    # One name, so that the next command deletes what a killed one has left.
+    temporary = output.with_name(f".{output.name}.add_dynamics")
+    try:
+        temporary.mkdir(parents=True, exist_ok=True)
+        with FileLock(temporary / ".lock", timeout=0):
+            try:
+                for old in temporary.iterdir():
+                    shutil.rmtree(old) if old.is_dir() else old.name == ".lock" or old.unlink()
+                yield temporary
+                temporary.replace(output)
+                (output / ".lock").unlink()
+            finally:
+                shutil.rmtree(temporary, ignore_errors=True)
+    except Timeout as error:
+        raise ValueError(f"{output} is being written by another process; wait for it or stop it") from error
+    except OSError as error:
+        raise OSError(
+            f"cannot write {output} ({error}); is there space, and may the folder be written?"
+        ) from error
+
+
 def write_columns(
     root: Path,
     output: Path,
@@ -29,11 +65,11 @@ def write_columns(
     names: list[str],
     replaced: dict[str, dict | None] | None = None,
 ) -> None:
-    """Copy a dataset with new or replaced columns to a new folder, which appears when it is complete.
+    """Copy a dataset with new or replaced columns.
 
     Args:
         root: folder of the dataset.
-        output: the new folder.
+        output: folder that is written to, such as that of :func:`new_folder`.
         info: content of the dataset's ``meta/info.json``.
         table: ``index`` and ``episode_index`` of all frames, in order.
         values: new columns, float32 or bool ``[N, D]``, by name.
@@ -45,43 +81,33 @@ def write_columns(
         ValueError: a file of the dataset is damaged.
         OSError: the folder cannot be written.
     """
-    # One name, so that the next command deletes what a killed one has left.
-    temporary, replaced = output.with_name(f".{output.name}.add_dynamics"), replaced or {}
+    replaced = replaced or {}
     stats = read_json(path) if (path := root / "meta" / "stats.json").exists() else {}
-    try:
-        shutil.rmtree(temporary, ignore_errors=True)
-        for file in sorted(
-            folder / name for folder, _, files in root.walk(follow_symlinks=True) for name in files
-        ):
-            relative = file.relative_to(root)
-            if any(part.startswith(".") for part in relative.parts) or str(relative) in replaced:
-                continue  # names with a dot are notes of the hub and of file managers
-            target = temporary / relative
-            target.parent.mkdir(parents=True, exist_ok=True)
-            if relative.parts[0] == "data" and file.suffix == ".parquet":
-                _write_rows(file, target, table["index"].to_numpy(), values)
-            elif relative.parts[:2] == ("meta", "episodes") and file.suffix == ".parquet":
-                _write_episodes(file, target, dict(spans(table["episode_index"].to_numpy())), values)
-            elif relative.parts[0] == "videos":
-                _link(file, target)
-            else:
-                shutil.copy2(file, target)
-        shape = [len(names)]
-        features = {n: {"dtype": str(v.dtype), "shape": shape, "names": names} for n, v in values.items()}
-        write_json(temporary / "meta" / "info.json", info | {"features": info["features"] | features})
-        for name, numbers in values.items():
-            stats[name] = {key: value.tolist() for key, value in compute_stats(numbers).items()}
-        write_json(temporary / "meta" / "stats.json", stats)
-        for name, content in replaced.items():
-            if content is not None:
-                write_json(temporary / name, content)
-        temporary.replace(output)
-    except OSError as error:
-        raise OSError(
-            f"cannot write {output} ({error}); is there space, and may the folder be written?"
-        ) from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    for file in sorted(
+        folder / name for folder, _, files in root.walk(follow_symlinks=True) for name in files
+    ):
+        relative = file.relative_to(root)
+        if any(part.startswith(".") for part in relative.parts) or str(relative) in replaced:
+            continue  # names with a dot are notes of the hub and of file managers
+        target = output / relative
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if relative.parts[0] == "data" and file.suffix == ".parquet":
+            _write_rows(file, target, table["index"].to_numpy(), values)
+        elif relative.parts[:2] == ("meta", "episodes") and file.suffix == ".parquet":
+            _write_episodes(file, target, dict(spans(table["episode_index"].to_numpy())), values)
+        elif relative.parts[0] == "videos":
+            _link(file, target)
+        else:
+            shutil.copy2(file, target)
+    shape = [len(names)]
+    features = {n: {"dtype": str(v.dtype), "shape": shape, "names": names} for n, v in values.items()}
+    write_json(output / "meta" / "info.json", info | {"features": info["features"] | features})
+    for name, numbers in values.items():
+        stats[name] = {key: value.tolist() for key, value in compute_stats(numbers).items()}
+    write_json(output / "meta" / "stats.json", stats)
+    for name, content in replaced.items():
+        if content is not None:
+            write_json(output / name, content)
 
 
 def _write_rows(file: Path, target: Path, index: np.ndarray, values: dict[str, np.ndarray]) -> None:
