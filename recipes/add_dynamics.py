@@ -126,5 +126,5 @@ def main(config: Config) -> None:
 
 if __name__ == "__main__":
     run_recipe(
-        main, Config, sys.argv, stopped="the same command starts again, if the new folder is not there yet"
+        main, Config, sys.argv, stopped="a new folder that is there is complete; otherwise repeat the command"
     )

@@ -2,12 +2,14 @@
 
 from pathlib import Path
 
+import cv2
 import lerobot.utils.constants
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from dynmap_rl.data.format.frames import choose_camera
+from dynmap_rl.data.format.frames import choose_camera, iterate_frames
 from dynmap_rl.data.format.reading import choose_splits, find_dataset, read_table
 from dynmap_rl.utils.files import write_json
 
@@ -32,6 +34,26 @@ def test_rows_are_in_order_of_time(tmp_path):
     info = {"total_frames": 4, "features": {}}
     assert read_table(tmp_path, info, [])["index"].to_pylist() == [0, 1, 2, 3]
     assert read_table(tmp_path, info, [], by_time=False)["index"].to_pylist() == [2, 3, 0, 1]
+
+
+@pytest.mark.parametrize("index", [[0, 1, 1, 2], [0, 1, 0, 1], [1, 2, 3, 4]])
+def test_an_index_that_does_not_number_the_frames_is_refused(tmp_path, index):
+    (tmp_path / "data/chunk-000").mkdir(parents=True)
+    table = pa.table({"index": index, "episode_index": [0, 0, 1, 1]})
+    pq.write_table(table, tmp_path / "data/chunk-000/file-000.parquet")
+    with pytest.raises(ValueError, match="number all frames"):
+        read_table(tmp_path, {"total_frames": 4, "features": {}}, [])
+
+
+def test_frames_of_two_sizes_are_refused(tmp_path):
+    (tmp_path / "data/chunk-000").mkdir(parents=True)
+    images = [cv2.imencode(".png", np.zeros((side, 8, 3), np.uint8))[1].tobytes() for side in (8, 6)]
+    frames = [{"bytes": image, "path": None} for image in images]
+    table = pa.table({"episode_index": [0, 0], "timestamp": [0.0, 0.1], "top": frames})
+    pq.write_table(table, tmp_path / "data/chunk-000/file-000.parquet")
+    info = {"features": {"top": {"dtype": "image", "shape": [8, 8, 3]}}}
+    with pytest.raises(ValueError, match="episode 0 must have one size"):
+        next(iterate_frames(tmp_path, info, "top"))
 
 
 def test_an_id_is_looked_for_where_lerobot_records(tmp_path, monkeypatch):

@@ -50,7 +50,12 @@ def _is_depth(feature: dict) -> bool:
 
 
 def iterate_frames(
-    root: Path, info: dict, camera: str, size: tuple[int, int] | None = None, widest: int | None = None
+    root: Path,
+    info: dict,
+    camera: str,
+    size: tuple[int, int] | None = None,
+    widest: int | None = None,
+    only: int | None = None,
 ) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
     """Iterate over the episodes' frames.
 
@@ -62,6 +67,7 @@ def iterate_frames(
         camera: column of the frames.
         size: width and height that frames are resized to, whatever their own aspect.
         widest: width that wider frames are reduced to, in place of ``size``.
+        only: the one episode that is read; by default all.
 
     Yields:
         The episode's index, its frames uint8 ``[T, height, width, 3]`` (RGB), and the ratios of stored to returned width and
@@ -77,6 +83,8 @@ def iterate_frames(
     for file in sorted((root / "data").glob("*/*.parquet")):
         table = read_file(file, columns)
         for episode, span in spans(table["episode_index"].to_numpy()):
+            if only not in (None, episode):
+                continue
             rows = table.slice(span.start, span.stop - span.start)
             blocks = (
                 _decode_video(root, info, episodes, camera, rows)
@@ -87,6 +95,10 @@ def iterate_frames(
             for block in blocks:
                 height, width = block[0].shape[:2]
                 frames += [_resize(frame, size or _reduced(frame, widest)) for frame in block]
+            if len(sizes := {frame.shape[:2] for frame in frames}) > 1:
+                raise ValueError(
+                    f"{file}: frames of episode {episode} must have one size, got {sorted(sizes)}; restore the dataset"
+                )
             yield episode, np.stack(frames), np.divide([width, height], frames[0].shape[1::-1])
 
 
@@ -139,7 +151,10 @@ def _decode_video(
             frames = decode_video_frames(path, some, TOLERANCE, backend="pyav", return_uint8=True)
         except Exception as error:  # LeRobot and FFmpeg below it raise many kinds
             reason = first_line(error)
-            raise ValueError(f"{path} cannot be decoded ({reason}); restore the dataset") from error
+            raise ValueError(
+                f"{path} cannot be decoded ({reason}); restore the dataset, and see that its timestamps are those of the "
+                "video's frames"
+            ) from error
         yield frames.permute(0, 2, 3, 1).numpy()
 
 

@@ -36,7 +36,10 @@ def find_dataset(dataset: str | Path) -> Path:
     if folder.is_dir():
         return folder
     if not is_hub_id(dataset, "datasets"):
-        raise ValueError(f"no dataset at {dataset}; record one with recipes/collect.py --output {dataset}")
+        raise ValueError(
+            f"no dataset at {dataset}; check the path, or record the demonstrations of a task with recipes/collect.py "
+            f"--output {dataset}"
+        )
     from httpx import HTTPError
     from huggingface_hub import snapshot_download
     from lerobot.utils.constants import HF_LEROBOT_HOME, HF_LEROBOT_HUB_CACHE
@@ -87,13 +90,13 @@ def read_info(root: Path) -> dict:
     path = root / "meta" / "info.json"
     if not path.exists():
         raise ValueError(
-            f"{root} must be a LeRobot dataset, got a folder without meta/info.json; record one with "
-            "recipes/collect.py"
+            f"{root} must be a LeRobot dataset, got a folder without meta/info.json; check the path"
         )
     info = read_metadata(path)
     if (version := info.get("codebase_version")) != LEROBOT_VERSION:
         raise ValueError(
-            f"{root} must be of LeRobot's format {LEROBOT_VERSION}, got {version}; convert it with LeRobot's script"
+            f"{root} must be of LeRobot's format {LEROBOT_VERSION}, got {version}; one of v2.1 is converted by "
+            "python -m lerobot.scripts.convert_dataset_v21_to_v30 (see its --help)"
         )
     check_form(info, INFO, str(path))
     check_form(info.get("splits") or {}, {str: str}, f"{path}, splits")
@@ -147,6 +150,10 @@ def choose_splits(
         splits = {"train": [e for e in episodes if e not in held_out], "eval": held_out}
     if usable is not None:
         splits = {name: [e for e in members if e in usable] for name, members in splits.items()}
+    if len(episodes) < 2:
+        raise ValueError(
+            f"{root} must have at least two episodes, one to train on and one held out; record more"
+        )
     if not all(splits.values()):
         found = ", ".join(f"{len(members)} in {name}" for name, members in splits.items())
         raise ValueError(
@@ -201,7 +208,7 @@ def read_table(root: Path, info: dict, columns: list[str], by_time: bool = True)
         by_time: sort by ``index``; otherwise the order is that of the files.
 
     Raises:
-        ValueError: a file is damaged, or columns or frames are missing.
+        ValueError: a file is damaged, columns or frames are missing, or ``index`` does not number the frames.
     """
     tables = list(iterate_tables(root, columns))
     try:
@@ -214,7 +221,15 @@ def read_table(root: Path, info: dict, columns: list[str], by_time: bool = True)
         raise ValueError(
             f"{root} must have {info['total_frames']} frames, got {len(table)}; restore it or record it again"
         )
-    return table.sort_by("index") if by_time else table
+    if not by_time:
+        return table
+    table = table.sort_by("index")
+    if (wrong := table["index"].to_numpy() != np.arange(len(table))).any():
+        raise ValueError(
+            f"the column index of {root} must number all frames from 0, got {table['index'][int(wrong.argmax())]} for frame "
+            f"{wrong.argmax()}; number them anew, in the order of episodes and time"
+        )
+    return table
 
 
 def read_column(
