@@ -17,6 +17,7 @@ from .motion import Motion
 
 EXPLAINED = 0.25  # share of the variance of colours that remains where objects have only changed places
 SMOOTH = 7, 2  # window and order of the smooth trajectory
+BY_EPISODE = "jumps", "order"  # checks that episodes pass or fail as a whole
 RESTS = 0.1  # extent of an object that rests in an episode, as a share of the mean
 
 # name: (limit, whether larger is worse, what is measured, advice)
@@ -100,7 +101,8 @@ def judge_quality(derived: Sequence[Derived]) -> dict:
     Returns:
         JSON values: ``verdict``, ``good`` or ``doubtful`` (a check fails); ``checks``, a dict by the names of
         :data:`LIMITS` of those that the source allows, each with ``value`` (of the worst object or entry), ``limit``,
-        ``good``, ``where`` (that object or entry), ``episode`` (the worst one), ``what`` and ``advice``.
+        ``good``, ``where`` (that object or entry), ``episode`` (the worst one), ``what`` and ``advice``; ``jumps`` and
+        ``order`` also with all ``episodes`` that fail.
     """
     rows: dict[int, dict] = {}  # values by check and place, by episode
     steps = {part.episode: len(part.position) for part in derived}
@@ -118,7 +120,7 @@ def judge_quality(derived: Sequence[Derived]) -> dict:
         if not found:
             continue
         sign = 1 if more else -1
-        weights = [1 if name in ("jumps", "order") else steps[e] for e, row in rows.items() if row.get(name)]
+        weights = [1 if name in BY_EPISODE else steps[e] for e, row in rows.items() if row.get(name)]
         join = np.max if name == "gone" else partial(np.average, weights=weights)
         means = {where: float(join([row[where] for row in found])) for where in found[0]}
         where = max(means, key=lambda key, means=means, sign=sign: sign * means[key])
@@ -134,6 +136,9 @@ def judge_quality(derived: Sequence[Derived]) -> dict:
             "what": what,
             "advice": advice,
         }
+        if name in BY_EPISODE:
+            own = {e: row[name][where] for e, row in rows.items() if row.get(name)}
+            checks[name]["episodes"] = [episode for episode, value in own.items() if value]
     good = all(check["good"] for check in checks.values())
     return {"verdict": "good" if good else "doubtful", "checks": checks}
 
@@ -149,11 +154,17 @@ def quality_text(quality: dict) -> str:
             f"episode {check['episode']}): {check['what']}"
         )
     lines += [
-        f"  to do, {name}: {check['advice']}"
+        f"  to do, {name}{_in_episodes(check)}: {check['advice']}"
         for name, check in quality["checks"].items()
         if not check["good"]
     ]
     return "\n".join(lines)
+
+
+def _in_episodes(check: dict, most: int = 20) -> str:
+    episodes = check.get("episodes", [])
+    more = ", ..." * (len(episodes) > most)
+    return f" (episodes {', '.join(map(str, episodes[:most]))}{more})" if episodes else ""
 
 
 def _extents(derived: Sequence[Derived]) -> dict[str, float]:

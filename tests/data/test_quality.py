@@ -134,7 +134,7 @@ def test_a_few_episodes_that_jump_are_found():
     broken = x + 0.3 * (np.arange(120) > 80)[:, None]
     checks = judge_many([broken if i in (3, 7) else x for i in range(50)])["checks"]
     assert checks["jumps"]["value"] == pytest.approx(2 / 50) and not checks["jumps"]["good"]
-    assert checks["residual"]["good"] and checks["jumps"]["episode"] == 3
+    assert checks["residual"]["good"] and checks["jumps"]["episodes"] == [3, 7]
     assert judge_many([broken if i == 3 else x for i in range(50)])["checks"]["jumps"]["good"]
 
 
