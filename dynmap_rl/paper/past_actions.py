@@ -28,7 +28,10 @@ from dynmap_rl.utils.devices import seed_everything
 
 
 class PastActionsPolicy(nn.Module):
-    """MLP policy ``a_t = pi(z_k, h_k, g, a_k, ..., a_{t-1}, t - k)`` on the state of the step k of the newest frame.
+    """MLP policy ``a_t = pi(z_k, h_k, g, a_{k-1}, ..., a_{t-1}, t - k)`` on the state of the step k of the newest frame.
+
+    The action before the frame is known to the state too. But the policy learns to repeat the newest action of its input with
+    small changes, and would fail without a delay if there were none.
 
     Args:
         latent_size: Z of the world model.
@@ -67,11 +70,12 @@ class PastActionsPolicy(nn.Module):
             hidden1: before that frame, ``[..., H]``.
             hidden2: before that frame, ``[..., H]``.
             goal: ``[..., G]`` (SI units).
-            past: the last K actions, the latest one last, ``[..., K, A]`` (SI units); those before the frame are not read.
+            past: the last K actions, the latest one last, ``[..., K, A]`` (SI units). Those more than a step before the frame
+                are not read.
             age: steps since the frame, int64 ``[..., 1]``, at most K.
         """
         steps = torch.arange(self.max_delay, 0, -1, device=age.device)
-        past = self.action.normalize(past) * (steps <= age).unsqueeze(-1)
+        past = self.action.normalize(past) * (steps <= age + 1).unsqueeze(-1)
         share = age / self.max_delay
         features = torch.cat(
             [latent, hidden1, hidden2, self.goal.normalize(goal), past.flatten(-2), share], -1
