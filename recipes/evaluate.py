@@ -197,4 +197,4 @@ def judge_expert(config: Config) -> tuple[Path, str, dict]:
 
 
 if __name__ == "__main__":
-    run_recipe(main, Config, sys.argv)
+    run_recipe(main, Config, sys.argv, stopped="repeat the command")

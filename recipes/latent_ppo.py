@@ -4,8 +4,9 @@
 
 The policy reads latent, hidden states and goal, as imitating policies do, where the expert of ``recipes/expert.py``
 reads the simulator's state. Network, actions (accelerations) and algorithm are the same, and both are judged on the same
-scenes. Limit and length are not: here the cart has its full acceleration and ``--ppo.iterations``, 90, while the shipped
-experts of tasks 1 and 2 have a quarter of it, and 40 and 60 iterations. The same command resumes a stopped run, and prints the result of a finished one.
+scenes. Acceleration limit and length of training differ: this recipe has the full acceleration and 90 iterations, the shipped
+experts of tasks 1 and 2 have a quarter of it, and 40 and 60 iterations. The same command resumes a stopped run, and prints the
+result of a finished one.
 """
 
 import sys
@@ -67,6 +68,10 @@ def main(config: Config) -> None:
     check_logger(config.logger)
     task, ppo = get_task(config.task, kind=Task), config.ppo
     world_model, origin = load_world_model_of(config.pretrained)
+    if "task" not in origin or world_model.transition.action.size != len(task.layout.action_limit):
+        raise ValueError(
+            f"--pretrained must be of a task with the actions of {config.task}, got {config.pretrained}"
+        )
     world_model.requires_grad_(False)
     expert = experts.load_expert(config.expert or config.task)
     states_of = experts.task_of_expert(config.expert or config.task, task)

@@ -86,6 +86,8 @@ def main(config: Config) -> None:
         )
     if not 0 <= config.delay <= (MAX_DELAY if actor else 0):
         raise ValueError(f"--delay must be 0 to {MAX_DELAY} steps, with --policy, got {config.delay}")
+    if config.gif and config.gif.suffix != ".gif":
+        raise ValueError(f"--gif must end with .gif, got {config.gif}")
     if config.gif and not config.steps:
         raise ValueError("--gif needs --steps, the length of the animation")
     if config.push_to_hub and not config.record:
@@ -172,4 +174,4 @@ def save_film(frames: list, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    run_recipe(main, Config, sys.argv)
+    run_recipe(main, Config, sys.argv, stopped="repeat the command")

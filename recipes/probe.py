@@ -60,6 +60,10 @@ def main(config: Config) -> None:
     from dynmap_rl.utils.version import find_commit
 
     models, task = load_world_models(config.runs.split(","))
+    if (steps := get_task(task).layout.steps) < config.context + config.horizon:
+        raise ValueError(
+            f"--context and --horizon must be at most {steps} steps together, as an episode has no more"
+        )
     dataset = find_or_record(task, config.dataset)
     train = load_dataset(dataset, "train", config.cache)[: config.train_episodes]
     test = load_dataset(dataset, "eval", config.cache)[: config.test_episodes]
@@ -167,4 +171,4 @@ def describe(open_loop: dict, probes: dict, perception: dict, verdicts: dict, se
 
 
 if __name__ == "__main__":
-    run_recipe(main, Config, sys.argv)
+    run_recipe(main, Config, sys.argv, stopped="repeat the command")

@@ -21,7 +21,7 @@ class WorldModelTransform(Transform):
     is reset. Nothing has a gradient.
 
     In a replay buffer, or called on a TensorDict ``[B, T]``, the transform writes the same for whole windows. Memory
-    is then zero wherever ``is_init`` ``[B, T, 1]`` is true, or at t = 0 if the TensorDict has no ``is_init``.
+    is then zero at t = 0, also in a window from the middle of an episode, and wherever ``is_init`` ``[B, T, 1]`` is true.
 
     Args:
         world_model: world model that encodes and predicts.

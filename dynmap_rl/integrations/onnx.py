@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import shutil
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -52,28 +52,26 @@ def export_to_onnx(run: str | Path, folder: str | Path, seed: int = 0) -> Path:
     from dynmap_rl.runs.lookup import load_actor
 
     actor, folder, batch = load_actor(run, seed).eval(), Path(folder), torch.export.Dim("batch")
-    temporary = folder / ".tmp"  # parts of two exports would fit together
-    shutil.rmtree(temporary, ignore_errors=True)
-    temporary.mkdir(parents=True)
-    for part, (function, sizes, outputs) in _list_parts(actor).items():
-        size, cameras = actor.world_model.image_size, actor.world_model.cameras
-        pixels = torch.zeros(2, 3, size, cameras * size, dtype=torch.uint8)
-        inputs = tuple(pixels if size is None else torch.zeros(2, size) for size in sizes.values())
-        with warnings.catch_warnings(), torch.no_grad():
-            warnings.simplefilter("ignore")
-            program = torch.onnx.export(
-                _as_module(actor, function),
-                inputs,
-                dynamo=True,
-                verbose=False,
-                input_names=list(sizes),
-                output_names=outputs,
-                dynamic_shapes=(tuple({0: batch} for _ in inputs),),
-            )
-        program.save(temporary / f"{part}.onnx")
-    for path in temporary.iterdir():
-        path.replace(folder / path.name)
-    temporary.rmdir()
+    folder.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(dir=folder) as temporary:  # parts of two exports would fit together
+        for part, (function, sizes, outputs) in _list_parts(actor).items():
+            size, cameras = actor.world_model.image_size, actor.world_model.cameras
+            pixels = torch.zeros(2, 3, size, cameras * size, dtype=torch.uint8)
+            inputs = tuple(pixels if size is None else torch.zeros(2, size) for size in sizes.values())
+            with warnings.catch_warnings(), torch.no_grad():
+                warnings.simplefilter("ignore")
+                program = torch.onnx.export(
+                    _as_module(actor, function),
+                    inputs,
+                    dynamo=True,
+                    verbose=False,
+                    input_names=list(sizes),
+                    output_names=outputs,
+                    dynamic_shapes=(tuple({0: batch} for _ in inputs),),
+                )
+            program.save(Path(temporary) / f"{part}.onnx")
+        for path in Path(temporary).iterdir():
+            path.replace(folder / path.name)
     return folder
 
 
@@ -168,7 +166,14 @@ class OnnxActor:
         Args:
             pixels: frames uint8 ``[B, 3, S, cameras * S]``.
             goal: goals ``[B, G]`` (SI units).
+
+        Raises:
+            ValueError: the batch has another size than in the last call.
         """
+        if any(len(memory) != len(pixels) for memory in self._memory.values()):
+            raise ValueError(
+                f"pixels must have the batch of the last call, got {len(pixels)}; call reset for another"
+            )
         values = self._memory | {"pixels": pixels, "goal": goal.astype(np.float32)}
         found = {}
         for part in ("encoder", "policy", "transition"):

@@ -8,7 +8,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequ
 from tensordict.utils import NestedKey, unravel_key
 from torchrl.envs import TensorDictPrimer
 
-from .memory import make_primer, recall, remember, warn_without_memory
+from .memory import find, make_primer, recall, remember, warn_without_memory
 from .policy import FeedforwardPolicy, RecurrentPolicy
 from .world_model import WorldModel
 
@@ -204,12 +204,13 @@ class Actor(TensorDictModuleBase):
         """Write ``latent``: the encoded frame or, without a frame, the predicted latent.
 
         Raises:
-            KeyError: there is neither a frame nor a predicted latent.
+            KeyError: there is neither a frame nor a predicted latent, or an episode begins without a frame.
         """
-        pixels = tensordict.get(self.pixels, None)
+        pixels = find(tensordict, self.pixels)
         if pixels is None:
-            predicted = tensordict.get(self.predicted_latent, None)
-            check_frame(self.pixels, predicted is not None)
+            predicted, begins = (find(tensordict, key) for key in (self.predicted_latent, self.is_init))
+            begun = begins is None or torch.compiler.is_compiling() or not begins.any()
+            check_frame(self.pixels, predicted is not None and begun)
             return tensordict.set(self.latent, predicted)
         return tensordict.set(self.latent, self.world_model.encode(pixels, self.mixed))
 
@@ -241,6 +242,6 @@ def check_frame(pixels: NestedKey, predicted: bool) -> None:
     """Raise ``KeyError`` where there is no predicted latent in the place of a frame."""
     if not predicted:
         raise KeyError(
-            f"there is no frame {pixels!r} and no latent that was predicted before it; environments of this package "
-            "need from_pixels=True"
+            f"there is no frame {pixels!r} and no latent that was predicted before it; an episode must begin with a frame of "
+            "its first step, and environments of this package need from_pixels=True"
         )

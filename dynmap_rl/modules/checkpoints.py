@@ -14,6 +14,9 @@ from .normalization import Normalizer
 from .policy import FeedforwardPolicy, RecurrentPolicy
 from .world_model import WorldModel
 
+MOST_CAMERAS = (
+    16  # of a checkpoint, which may be from elsewhere: each has an encoder and a decoder of its own
+)
 POLICIES = {policy.kind: policy for policy in (FeedforwardPolicy, RecurrentPolicy)}
 
 
@@ -88,8 +91,10 @@ def save_world_model(folder: Path, model: WorldModel) -> None:
         "image_size": model.image_size,
         "cameras": model.cameras,
     }
+    save_weights(
+        Path(folder) / "weights.safetensors", model
+    )  # first: arguments alone would be a damaged checkpoint
     write_json(Path(folder) / "arguments.json", arguments)
-    save_weights(Path(folder) / "weights.safetensors", model)
 
 
 def load_world_model(folder: Path) -> WorldModel:
@@ -106,6 +111,8 @@ def load_world_model(folder: Path) -> WorldModel:
             f"{folder} has the keypoints of the first release, which this one lacks; train it again"
         )
     arguments.setdefault("architecture", "plain")
+    if not 1 <= (cameras := arguments.get("cameras", 1)) <= MOST_CAMERAS:
+        raise ValueError(f"{folder}/arguments.json must have 1 to {MOST_CAMERAS} cameras, got {cameras}")
 
     def make() -> WorldModel:
         dynamics = {q: _blank(size) for q, size in arguments["dynamics"].items()}
@@ -130,8 +137,8 @@ def save_policy(folder: Path, policy: FeedforwardPolicy | RecurrentPolicy, world
         "goal": policy.goal.size,
         "width": policy.width,
     }
-    write_json(Path(folder) / "arguments.json", arguments)
     save_weights(Path(folder) / "weights.safetensors", policy)
+    write_json(Path(folder) / "arguments.json", arguments)
 
 
 def load_policy(folder: Path) -> FeedforwardPolicy | RecurrentPolicy:
@@ -155,7 +162,13 @@ def load_policy(folder: Path) -> FeedforwardPolicy | RecurrentPolicy:
 def _read_arguments(folder: Path) -> dict:
     path = Path(folder) / "arguments.json"
     if not path.exists():
-        raise ValueError(f"{folder} holds no checkpoint (no arguments.json); train one first")
+        seeds = sorted(
+            p.parent.parent.name for p in Path(folder).parents[1].glob("seed_*/policy/arguments.json")
+        )
+        there = f", but one in {', '.join(seeds)}" if seeds else ""
+        raise ValueError(
+            f"no checkpoint in {folder} (no arguments.json){there}; check the path, or train one"
+        )
     return read_json(path)
 
 

@@ -47,13 +47,25 @@ class ChunkActor:
         Args:
             pixels: frames uint8 ``[B, 3, S, cameras * S]``.
             goal: goals ``[B, G]`` (SI units).
-            step: number of the step before which the frames were taken, from 0. Step 0, and a step before that of the
-                last call, begin a new episode, as does :meth:`reset`. By default, the whole last chunk has been
-                executed since the last frame.
+            step: number of the step before which the frames were taken, from 0. Step 0 begins a new episode, as does
+                :meth:`reset`. By default, the whole last chunk has been executed since the last frame.
+
+        Raises:
+            ValueError: the step is before that of the last call, as of a frame that was overtaken, or the batch has
+                another size.
         """
         step = max(self.steps, default=-1) + 1 if step is None else step
-        if step == 0 or step < self.first:
+        if step == 0:
             self.reset()
+        if step < self.first:
+            raise ValueError(
+                f"step must not be before {self.first}, the step of the last call, got {step}; leave out frames that "
+                "were overtaken, or call reset for a new episode"
+            )
+        if any(len(td) != len(goal) for td in self.steps.values()):
+            raise ValueError(
+                f"goal must have the batch of the last call, got {len(goal)}; call reset for another"
+            )
         # Where a robot has waited for a chunk, its step may lie beyond the last chunk.
         before = min(step - 1, max(self.steps, default=-1))
         chunk = {step - 1: self.steps[before]} if before in self.steps else {}

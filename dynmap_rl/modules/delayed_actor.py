@@ -12,7 +12,7 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs import TensorDictPrimer
 
 from .actor import MEMORY, Actor, check_frame
-from .memory import check_memory, remember, warn_without_memory
+from .memory import check_memory, find, remember, warn_without_memory
 from .world_model import WorldModel
 
 BASE = ("predicted_latent", *MEMORY)  # state of the world model before the oldest step that is remembered
@@ -27,14 +27,14 @@ class DelayedActor(TensorDictModuleBase):
     latent and hidden states of the present, and the policy acts on them. The policy's own memory goes on from step to
     step, and is never repeated. Without delay, the actions are exactly those of :class:`Actor`.
 
-    It reads and writes what ``actor`` does, except that the world model's memory is now an output, the estimate of the
-    present, and that ``history``, a TensorDict, is read at t and written under ``next``. It also reads ``delay`` int64
+    In addition to the entries of ``actor``, it reads ``history``, a TensorDict, at t and writes it under ``next``. The world
+    model's memory is only written: it is the estimate of the present. It also reads ``delay`` int64
     ``[..., 1]``: the number of steps since the frame in ``pixels`` was taken. Several frames that arrive in the same
     step have one more axis, ``pixels`` ``[..., M, 3, S, cameras * S]`` and ``delay`` ``[..., M]``, in any order. A negative delay
     marks a place without a frame, and frames from before the episode are not used. Of several frames of one step, the last
     is used. :class:`dynmap_rl.envs.DelayTransform` writes both entries. Without ``delay`` in the TensorDict, every frame is
-    as old as the argument ``delay``, or the first one of the episode. Without ``pixels``, no frame has arrived; an episode
-    must begin with one.
+    as old as the argument ``delay``, or the first one of the episode. Without ``pixels``, no frame has arrived. An episode
+    must begin with a frame without delay, as a robot waits for it before it moves.
 
     A call is :meth:`observe`, :meth:`act` and :meth:`predict`, as that of :class:`Actor`. In ``env.rollout`` or a
     collector, append :meth:`make_tensordict_primer` and ``InitTracker`` to the environment.
@@ -50,7 +50,7 @@ class DelayedActor(TensorDictModuleBase):
     Raises:
         ValueError: ``delay`` is negative, above ``max_delay`` or not whole; or, in a call, there is not one delay for
             each frame.
-        KeyError: an episode begins without a frame.
+        KeyError: an episode begins without a frame of its first step.
     """
 
     def __init__(
@@ -134,7 +134,7 @@ class DelayedActor(TensorDictModuleBase):
 
     def _recall(self, tensordict: TensorDictBase) -> TensorDict:
         """Return a copy of the history, which is empty where it is absent and where an episode begins."""
-        history, begins = tensordict.get(self.history, None), tensordict.get(self.actor.is_init, None)
+        history, begins = find(tensordict, self.history), find(tensordict, self.actor.is_init)
         check_memory(tensordict, [self.history], begins)
         if history is None:
             batch, device = tensordict.batch_size, next(self.parameters()).device
@@ -146,11 +146,15 @@ class DelayedActor(TensorDictModuleBase):
 
     def _receive(self, tensordict: TensorDictBase, history: TensorDict) -> None:
         """Encode the frames that arrive and put each where it belongs."""
-        pixels, step = tensordict.get(self.actor.pixels, None), history["step"]
-        if pixels is None:
-            check_frame(self.actor.pixels, bool(step.any()))
-            return
-        delay = tensordict.get(self.delay_key, step.clamp(max=self.delay))
+        pixels, step = find(tensordict, self.actor.pixels), history["step"]
+        if pixels is not None:
+            self._place(tensordict, history, pixels)
+        if not torch.compiler.is_compiling():
+            check_frame(self.actor.pixels, bool((history["arrived"][..., -1, :] | (step > 0)).all()))
+
+    def _place(self, tensordict: TensorDictBase, history: TensorDict, pixels: torch.Tensor) -> None:
+        step, delay = history["step"], find(tensordict, self.delay_key)
+        delay = step.clamp(max=self.delay) if delay is None else delay
         if pixels.ndim == tensordict.ndim + 3:
             pixels = pixels.unsqueeze(-4)  # (..., M, 3, 64, 64) with M = 1
         if delay.shape != pixels.shape[:-3] or delay.is_floating_point():

@@ -24,7 +24,7 @@ class Encoder(nn.Module):
         """Encode frames ``[..., 3, S, S]`` in 0..255, uint8 or float, as latents ``[..., Z]``.
 
         Raises:
-            ValueError: the frames have another shape, or are floats in 0..1.
+            ValueError: the frames have another shape, or are floats in 0..1 or below 0.
         """
         side = self.image_size
         if pixels.shape[-3:] != (3, side, side):
@@ -33,10 +33,13 @@ class Encoder(nn.Module):
             size = self.encode(pixels.new_zeros(1, 3, side, side)).shape[-1]
             return torch.zeros(*pixels.shape[:-3], size, device=pixels.device)
         # A frame in 0..1 would be read as a black one.
-        if pixels.is_floating_point() and not torch.compiler.is_compiling() and 0 < pixels.amax() <= 1:
-            raise ValueError(
-                "pixels must be in 0..255, got floats in 0..1; give uint8 frames, without ToTensorImage"
-            )
+        if pixels.is_floating_point() and not torch.compiler.is_compiling():
+            low, high = pixels.aminmax()
+            if low < 0 or 0 < high <= 1:
+                raise ValueError(
+                    f"pixels must be in 0..255, got floats in {low:.3g}..{high:.3g}; give uint8 frames, without ToTensorImage "
+                    "and normalisation"
+                )
         x = pixels.reshape(-1, 3, side, side)
         # Without gradients, chunks that fit into the processor's cache are twice as fast.
         chunks = (x,) if torch.is_grad_enabled() else x.split(64)

@@ -14,12 +14,23 @@ from torchrl.envs import TensorDictPrimer
 from torchrl.modules import recurrent_mode
 
 
+def find(tensordict: TensorDictBase, key: NestedKey) -> torch.Tensor | TensorDictBase | None:
+    """Return an entry, or None where it is absent.
+
+    ``torch.compile`` compiles again where the keys have changed, which it does not notice of ``get`` with a default.
+    """
+    return tensordict[key] if unravel_key(key) in tensordict.keys(include_nested=True) else None
+
+
 def recall(tensordict: TensorDictBase, sizes: dict, is_init: NestedKey, device) -> tuple[torch.Tensor, ...]:
     """Return the entries of ``sizes``; zeros where an episode begins, and where they and ``is_init`` are absent."""
-    batch, begins = tensordict.batch_size, tensordict.get(is_init, None)
+    batch, begins = tensordict.batch_size, find(tensordict, is_init)
     check_memory(tensordict, sizes, begins)
-    state = tuple(tensordict.get(k, torch.zeros(*batch, n, device=device)) for k, n in sizes.items())
-    return state if begins is None else tuple(s.masked_fill(begins, 0.0) for s in state)
+    found = {key: find(tensordict, key) for key in sizes}
+    state = [
+        torch.zeros(*batch, n, device=device) if found[k] is None else found[k] for k, n in sizes.items()
+    ]
+    return tuple(state if begins is None else (s.masked_fill(begins, 0.0) for s in state))
 
 
 def check_memory(tensordict: TensorDictBase, keys: Iterable[NestedKey], begins: torch.Tensor | None) -> None:
@@ -33,7 +44,7 @@ def check_memory(tensordict: TensorDictBase, keys: Iterable[NestedKey], begins: 
         raise RuntimeError(
             "an actor reads one time step; windows are for make_world_model_module and make_policy_module"
         )
-    missing = [key for key in keys if tensordict.get(key, None) is None]
+    missing = [key for key in keys if find(tensordict, key) is None]
     if missing and begins is not None and not begins.all():
         raise KeyError(
             f"{missing[0]} is missing after the first step; append actor.make_tensordict_primer() to the environment"
@@ -44,9 +55,7 @@ def warn_without_memory(
     actor: TensorDictModuleBase, tensordict: TensorDictBase, keys: Iterable[NestedKey]
 ) -> None:
     """Warn if neither memory nor the start of episodes is there in two calls in a row, as in an environment without both."""
-    blind = (
-        any(tensordict.get(key, None) is None for key in keys) and tensordict.get(actor.is_init, None) is None
-    )
+    blind = any(find(tensordict, key) is None for key in keys) and find(tensordict, actor.is_init) is None
     if blind and actor.blind:
         warnings.warn(
             "the actor had no memory in two calls in a row; append InitTracker() and actor.make_tensordict_primer() to the "

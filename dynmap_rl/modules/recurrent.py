@@ -25,6 +25,10 @@ class TwoLSTM(nn.Module):
         self.lstm2 = nn.LSTM(hidden_size, hidden_size, batch_first=True)
         self.hidden_size = hidden_size
 
+    def train(self, mode: bool = True) -> TwoLSTM:
+        """Stay in training mode: cuDNN has no gradients in the other one, and without dropout both give the same."""
+        return super().train()
+
     def forward(
         self, x: torch.Tensor, state: State | None = None
     ) -> tuple[torch.Tensor, torch.Tensor, State]:

@@ -27,8 +27,8 @@ class RobotActor:
 
     The episode begins with the first call of :meth:`act`, which needs a frame. The robot is at rest before it, so that
     the newest frame then counts as the frame of that moment. Every later frame belongs to the call of :meth:`act` that is
-    nearest to its timestamp, and of several frames that arrive together for a call, the nearest is used; frames older
-    than ``max_delay`` steps are not used, and after ``max_delay`` of them in a row there is a warning: two clocks may differ.
+    nearest to its timestamp. If several frames arrive together for a call, the nearest is used. Frames older than
+    ``max_delay`` steps are not used; after ``max_delay`` of them in a row, :meth:`act` warns that two clocks may differ.
 
     A call may be late by up to three quarters of a period. Where it is later, control steps were missed, which count as
     steps with an action of zero, or with the last one again (``hold``); after a longer gap than ``max_delay`` steps, the
@@ -95,23 +95,31 @@ class RobotActor:
         self._check_reset()
         if timestamp >= self.since:
             self.frames.append((timestamp, frame))
+            # While act is not called, frames that can no longer be used are forgotten.
+            oldest = max(time for time, _ in self.frames) - (self.actor.max_delay + 2) * self.period
+            self.frames = [pair for pair in self.frames if pair[0] >= oldest]
 
     @torch.no_grad()
     def act(self, now: float) -> np.ndarray:
         """Return the action of the control step that begins now, float32 ``[A]`` (SI units).
 
         Raises:
-            ValueError: no frame has arrived before the first action, ``now`` is not after the last call, a frame was taken
-                more than a period after ``now``, or :meth:`reset` was not called.
+            ValueError: no frame has arrived before the first action, ``now`` is not finite or not after the last call, a
+                frame was taken more than a period after ``now``, or :meth:`reset` was not called.
         """
         self._check_reset()
+        if not math.isfinite(now):
+            raise ValueError(f"now must be finite, got {now}")
         if (newest := max((time for time, _ in self.frames), default=now)) > now + self.period:
             self.frames = []
             raise ValueError(
                 f"a frame of {newest} cannot have arrived at {now}; observe and act need one clock"
             )
         if self.times and not now > self.times[-1]:
-            raise ValueError(f"now must be after the last call at {self.times[-1]}, got {now}")
+            raise ValueError(
+                f"now must be after the last call at {self.times[-1]}, got {now}; use a monotonic clock such as "
+                "time.monotonic(), or call reset"
+            )
         if self.times:
             self._miss_steps(now)
         elif self.frames:

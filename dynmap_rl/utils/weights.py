@@ -1,4 +1,4 @@
-"""Weights as safetensors: a file from elsewhere runs no code and takes memory in proportion to its size."""
+"""Weights as safetensors: a file from elsewhere runs no code, and its weights take memory in proportion to its size."""
 
 from __future__ import annotations
 
@@ -16,7 +16,10 @@ from .files import write_bytes
 
 def save_weights(path: Path, module: nn.Module) -> None:
     """Write a module's state as safetensors, atomically."""
-    write_bytes(path, save({k: v.detach().cpu().contiguous() for k, v in module.state_dict().items()}))
+    # Clones, as two names of one tensor are refused.
+    write_bytes(
+        path, save({k: v.detach().cpu().contiguous().clone() for k, v in module.state_dict().items()})
+    )
 
 
 def load_module[Module: nn.Module](path: Path, make: Callable[[], Module]) -> Module:
@@ -47,7 +50,10 @@ def load_module[Module: nn.Module](path: Path, make: Callable[[], Module]) -> Mo
     except OSError:
         raise
     except Exception as error:  # torch on impossible sizes, safetensors on damaged files
-        raise ValueError(f"{path} does not hold this model's weights: {error}") from error
+        raise ValueError(
+            f"{path} and arguments.json beside it do not belong together or are damaged ({error}); download them again, or "
+            "train again"
+        ) from error
     return module
 
 

@@ -197,4 +197,4 @@ FIGURES = {  # functions and captions
 
 
 if __name__ == "__main__":
-    run_recipe(main, Config, sys.argv)
+    run_recipe(main, Config, sys.argv, stopped="repeat the command")

@@ -204,3 +204,12 @@ def test_a_policy_of_another_class_has_no_memory():
     actor, frames = make_actor(), make_frames()
     with pytest.raises(TypeError, match="RecurrentPolicy, got Policy"):
         Actor(actor.world_model, Policy())(frames[:, 0].select("pixels", "goal"))
+
+
+@torch.no_grad()
+def test_an_episode_does_not_begin_with_a_latent_predicted_in_the_last_one():
+    actor, frames = make_actor(), make_frames()
+    td = actor(frames[:, 0].exclude("action"))["next"].copy().set("goal", frames["goal"][:, 1])
+    actor(td.copy().set("is_init", torch.zeros(2, 1, dtype=torch.bool)))
+    with pytest.raises(KeyError, match="must begin with a frame"):
+        actor(td.set("is_init", torch.tensor([[True], [False]])))

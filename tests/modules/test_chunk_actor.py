@@ -88,7 +88,7 @@ def test_the_first_actions_are_those_that_the_robot_executes_meanwhile(kind):
     assert not torch.allclose(second[:, 3], first[:, 7])
 
 
-def test_an_earlier_step_begins_a_new_episode():
+def test_the_first_step_begins_a_new_episode():
     actor, (pixels, goal) = make_actor("recurrent"), draw(2)
     chunks, fresh = ChunkActor(actor, size=6, delay=3), ChunkActor(actor, size=6, delay=3)
     for step in (0, 2):
@@ -96,8 +96,22 @@ def test_an_earlier_step_begins_a_new_episode():
     first = fresh.act(pixels[1], goal, step=0)  # its frame is another than in the episode before
     assert torch.equal(chunks.act(pixels[1], goal, step=0), first)
     assert torch.equal(fresh.act(pixels[1], goal, step=0), first), "after an episode of a single call, too"
+    with pytest.raises(ValueError, match="must have the batch of the last call"):
+        chunks.act(pixels[1, :1], goal[:1], step=1)
     # A robot that waited longer than a chunk goes on with its memory.
     assert not torch.allclose(chunks.act(pixels[1], goal, step=9), first)
+
+
+def test_a_frame_that_was_overtaken_is_refused():
+    """It does not clear the memory."""
+    actor, (pixels, goal) = make_actor("recurrent"), draw(3)
+    chunks, undisturbed = ChunkActor(actor, size=6), ChunkActor(actor, size=6)
+    for actor in (chunks, undisturbed):
+        for step in (0, 2):
+            actor.act(pixels[0], goal, step=step)
+    with pytest.raises(ValueError, match="must not be before 2"):
+        chunks.act(pixels[1], goal, step=1)
+    assert torch.equal(*(actor.act(pixels[2], goal, step=4) for actor in (chunks, undisturbed)))
 
 
 def test_a_step_beyond_the_last_chunk_may_be_repeated():

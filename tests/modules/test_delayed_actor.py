@@ -297,3 +297,31 @@ def test_delays_are_whole_steps():
         DelayedActor(make_actor(), max_delay=3)(td.set("delay", torch.zeros(2, 1)))
     with pytest.raises(ValueError, match="whole"):
         DelayedActor(make_actor(), delay=1.5)
+
+
+@torch.no_grad()
+def test_every_world_must_begin_with_a_frame_of_its_first_step():
+    frames = make_frames()
+    for delays in ([1, 1], [0, -1], [-1, -1]):
+        td = TensorDict({"goal": GOAL, "pixels": frames[:, 0], "delay": torch.tensor(delays)[:, None]}, [2])
+        with pytest.raises(KeyError, match="must begin with a frame"):
+            DelayedActor(make_actor(), max_delay=4)(td)
+    actor = DelayedActor(make_actor(), max_delay=4)
+    begun = actor(TensorDict({"goal": GOAL, "pixels": frames[:, 0]}, [2]))["next"].copy()
+    begun.update({"goal": GOAL, "is_init": torch.tensor([[False], [True]])})
+    with pytest.raises(KeyError, match="must begin with a frame"):
+        actor(begun)
+
+
+@torch.no_grad()
+def test_a_compiled_actor_remembers_what_it_has_seen():
+    """Its first call has no memory in the TensorDict."""
+    for actor in (make_actor(), DelayedActor(make_actor(), max_delay=2)):
+        results = []
+        for function in (actor, torch.compile(actor, backend="eager")):
+            td = TensorDict({}, [2])
+            for t in range(3):
+                td = function(td.copy().update({"goal": GOAL, "pixels": make_frames()[:, t]}))["next"]
+            results.append(td)
+        torch.testing.assert_close(results[0]["hidden1"], results[1]["hidden1"])
+        torch.testing.assert_close(results[0]["policy_hidden1"], results[1]["policy_hidden1"])

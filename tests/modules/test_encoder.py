@@ -21,6 +21,10 @@ def test_encoder_keeps_leading_axes_and_refuses_other_frames(make):
     assert encoder(frames[:0]).shape == (0, 3, 16) and encoder(frames[:0].float()).shape == (0, 3, 16)
     with pytest.raises(ValueError, match="32, 32"):
         encoder(torch.zeros(1, 3, 32, 32))
+    with pytest.raises(ValueError, match="floats in -1"):
+        encoder(frames.float() / 64 - 1)
+    shifted = torch.cat([torch.zeros(1, dtype=torch.uint8), frames.flatten()])[1:].view(frames.shape)
+    torch.testing.assert_close(encoder(shifted), latent)  # bytes that begin anywhere in memory
 
 
 @pytest.mark.parametrize("make", [GlimpseEncoder, PlainEncoder])

@@ -217,8 +217,13 @@ def test_wrong_use_gets_one_clear_error():
     for goal in ([0.5], 0.5, [0.5, float("nan")], np.empty(0)):
         with pytest.raises(ValueError, match="goal must be 2 finite numbers"):
             RobotActor(make_actor()).reset(goal)
-    for now in (5.0, 0.0, float("nan")):
-        with pytest.raises(ValueError, match="after the last call"):
+    for now, message in (
+        (5.0, "monotonic"),
+        (0.0, "monotonic"),
+        (float("nan"), "finite"),
+        (float("inf"), "finite"),
+    ):
+        with pytest.raises(ValueError, match=message):
             robot.act(now)
     with pytest.raises(ValueError, match="max_delay"):
         RobotActor(make_actor(max_delay=0))
@@ -231,3 +236,11 @@ def test_it_needs_an_actor_with_delays():
     actor = Actor(model, make_policy(CONSTANTS, "feedforward", model, width=20))
     with pytest.raises(TypeError, match="must be a DelayedActor, got Actor"):
         RobotActor(actor)
+
+
+def test_frames_do_not_pile_up_while_a_robot_is_paused():
+    robot = RobotActor(make_actor(max_delay=3), period=0.1)
+    robot.reset(GOAL)
+    for i in range(100):
+        robot.observe(FRAMES[0], i * 0.1)
+    assert len(robot.frames) <= 6 and robot.frames[-1][0] == pytest.approx(9.9)

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from small import CONSTANTS
+from small import CONSTANTS, make_model
 from tensordict import TensorDict
 
 from dynmap_rl.keys import DYNAMICS
@@ -138,3 +138,10 @@ def test_imagined_sequence_equals_steps_on_own_predictions():
     whole = model.transition.imagine(latent, td["action"], context=7)
     for found, expected in zip(whole, model.predict(latent, td["action"]), strict=True):
         torch.testing.assert_close(found, expected)
+
+
+def test_memories_stay_in_training_mode():
+    """In evaluation mode, cuDNN has no gradients, which fine-tuning and imagination need."""
+    model = make_model().eval()
+    assert not model.training and not model.encoder.training
+    assert all(part.training for part in model.modules() if isinstance(part, torch.nn.LSTM))
