@@ -62,7 +62,7 @@ def main(config: Config) -> None:
     models, task = load_world_models(config.runs.split(","))
     if (steps := get_task(task).layout.steps) < config.context + config.horizon:
         raise ValueError(
-            f"--context and --horizon must be at most {steps} steps together, as an episode has no more"
+            f"--context + --horizon must be at most {steps}, got {config.context} + {config.horizon}; an episode has no more"
         )
     dataset = find_or_record(task, config.dataset)
     train = load_dataset(dataset, "train", config.cache)[: config.train_episodes]

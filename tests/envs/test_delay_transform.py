@@ -121,6 +121,22 @@ def test_seeds():
 
 
 @both_forms
+def test_a_partial_reset_does_not_change_how_frames_of_other_worlds_arrive(bursts):
+    delay, found = FrameDelay(4, 2, 0.2, error=3), []
+    for reset in (False, True):
+        env, rows = make_env(delay, bursts=bursts), []
+        td = env.rollout(6, lambda td: td.set("action", torch.zeros(3, 3)))[:, -1]["next"].exclude("reward")
+        if reset:
+            td = env.reset(td.set("_reset", torch.tensor([[False], [True], [False]])))
+        for action in make_actions(12).unbind(1):
+            td = env.step(td.set("action", action))["next"]
+            rows.append(td.select("pixels", "delay")[[0, 2]])
+        found.append(torch.stack(rows, 1))
+    assert torch.equal(found[0]["delay"], found[1]["delay"])
+    assert torch.equal(found[0]["pixels"], found[1]["pixels"])
+
+
+@both_forms
 def test_a_partial_reset_leaves_the_other_worlds_as_they_are(bursts):
     env = make_env(bursts=bursts)
     before = env.rollout(6)[:, -1]["next"].exclude("reward")

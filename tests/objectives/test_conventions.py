@@ -127,6 +127,18 @@ def test_masking_the_end_of_windows_equals_cutting_it_off(td):
         torch.testing.assert_close(value, cut[key])
 
 
+def test_the_mask_is_that_of_the_decoded_frames(td):
+    loss = make("world model", rgb_frames=B * T // 2)
+    td["collector", "mask"] = (torch.arange(T) < T - 2).expand(B, T)
+    changed = td.clone()
+    changed["pixels"][:, T - 2 :] = 255 - changed["pixels"][:, T - 2 :]
+    losses = []
+    for some in (td, changed):
+        torch.manual_seed(0)
+        losses.append(loss(some)["loss_rgb"])
+    torch.testing.assert_close(*losses)
+
+
 def test_a_mask_without_valid_steps_gives_zero_with_few_decoded_frames(td):
     loss = make("world model", rgb_frames=2)
     td["collector", "mask"] = torch.zeros(B, T, dtype=torch.bool)

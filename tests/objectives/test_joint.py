@@ -53,6 +53,14 @@ def test_joint_is_the_world_model_loss_and_the_weighted_policy_loss(td):
     assert all(map(moved, (model.encoder, model.image_decoder, model.dynamics_decoder, policy)))
 
 
+def test_the_first_step_of_a_window_within_an_episode_has_no_emphasis(td):
+    loss, *_ = make(end_to_end=True, emphasis=9.0)
+    td["step_count"] = torch.arange(5)[:, None].repeat(2, 1, 1)
+    begins = loss(td)["loss_policy"]
+    td["step_count"] += 7
+    assert not torch.isclose(loss(td)["loss_policy"], begins, rtol=1e-3)
+
+
 def test_imagined_steps_are_refused():
     with pytest.raises(ValueError, match="imagined = 0, got 0.5"):
         JointLoss(WorldModelLoss(make_model(), imagined=0.5), make()[2])
