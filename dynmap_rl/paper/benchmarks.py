@@ -49,6 +49,7 @@ GAPS = (  # of which the page gives intervals
     ("RGB+[P+V]", "RGB+[P]"),
     ("RGB+[P+V]", "RGB+[P+V], hand and color"),
     ("RGB+[P+V], hand and color", "Only-RGB"),
+    ("RGB+[P+V], 96 pixels", "RGB+[P+V]"),
     ("RGB+[P+V]", "End-to-End"),
     ("RGB+[P+V]", "ACT"),
     ("End-to-End", "ACT"),

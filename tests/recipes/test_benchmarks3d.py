@@ -10,7 +10,7 @@ from dynmap_rl.utils.files import read_json, write_json
 def test_the_cells_are_listed_without_work(tmp_path):
     listed = run(tmp_path, "benchmarks3d", "--dry_run", "--results", "found", "--only", "soccer")
     assert listed.returncode == 0, listed.stderr
-    assert len(listed.stdout.splitlines()) == 10 * 3 + 1 and "0 of 30 runs" in listed.stdout
+    assert len(listed.stdout.splitlines()) == 13 * 3 + 1 and "0 of 39 runs" in listed.stdout
     assert not (tmp_path / "found").exists()
 
 

@@ -108,6 +108,7 @@ def test_labelled_episodes_are_whole_seeded_and_nested():
 def test_without_the_rgb_loss_the_decoder_of_frames_is_not_trained(tmp_path):
     model = make_model()
     before = [p.clone() for p in model.image_decoder.parameters()]
-    train_world_model(model, make_episodes(), tmp_path, replace(WORLD_MODEL, beta_rgb=0.0))
+    settings = replace(WORLD_MODEL, beta_rgb=0.0, rgb_frames=WorldModelTraining.rgb_frames)
+    train_world_model(model, make_episodes(), tmp_path, settings)
     assert all(torch.equal(a, b) for a, b in zip(before, model.image_decoder.parameters(), strict=True))
     assert "loss_rgb" not in read_metrics(tmp_path)[-1] and "loss_position" in read_metrics(tmp_path)[-1]
