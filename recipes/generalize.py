@@ -57,7 +57,7 @@ def main(config: Config) -> None:
     from dynmap_rl.reporting.run_page import row_text, write_report
     from dynmap_rl.runs.folder import open_run, plain_settings
     from dynmap_rl.runs.loggers import check_logger
-    from dynmap_rl.runs.lookup import load_world_model_of
+    from dynmap_rl.runs.lookup import check_actions, load_world_model_of
     from dynmap_rl.training.dagger import check_corrections
     from dynmap_rl.training.dataset import check_dataset, find_or_record
     from dynmap_rl.training.decoupled import check_copies, check_same, train_policies
@@ -77,10 +77,7 @@ def main(config: Config) -> None:
             f"--task must differ from the task of --pretrained, got {config.task} for both; choose another --task, or "
             "use recipes/decoupled.py"
         )
-    if "task" not in origin or world_model.transition.action.size != len(task.layout.action_limit):
-        raise ValueError(
-            f"--pretrained must be of a task with the actions of {config.task}, got {config.pretrained}"
-        )
+    check_actions(world_model, origin, task, config.pretrained)
     name = f"{origin['training']}_{'_'.join(world_model.supervision) or 'none'}_{config.policy.kind}"
     folder = config.run or Path("runs/generalize") / task.name / name
     open_run(folder, config, ignore=("run", "cache", "compute", "logger"))

@@ -53,7 +53,7 @@ def main(config: Config) -> None:
     from dynmap_rl.reporting.html import write_html
     from dynmap_rl.runs.folder import open_run, plain_settings
     from dynmap_rl.runs.loggers import check_logger
-    from dynmap_rl.runs.lookup import load_world_model_of
+    from dynmap_rl.runs.lookup import check_actions, load_world_model_of
     from dynmap_rl.training.decoupled import check_same
     from dynmap_rl.training.ppo import train_ppo
     from dynmap_rl.utils.devices import seed_everything
@@ -68,10 +68,7 @@ def main(config: Config) -> None:
     check_logger(config.logger)
     task, ppo = get_task(config.task, kind=Task), config.ppo
     world_model, origin = load_world_model_of(config.pretrained)
-    if "task" not in origin or world_model.transition.action.size != len(task.layout.action_limit):
-        raise ValueError(
-            f"--pretrained must be of a task with the actions of {config.task}, got {config.pretrained}"
-        )
+    check_actions(world_model, origin, task, config.pretrained)
     world_model.requires_grad_(False)
     expert = experts.load_expert(config.expert or config.task)
     states_of = experts.task_of_expert(config.expert or config.task, task)

@@ -73,7 +73,8 @@ def add_dynamics(
             unit.
         angle_noise: likewise of the angles.
         noise_seed: seed of the noise.
-        method: ``central`` or ``savgol`` (see :func:`dynmap_rl.data.differentiate`); by default central for a state, savgol for frames.
+        method: ``central`` or ``savgol`` (see :func:`dynmap_rl.data.differentiate`); by default central for a state, savgol
+            for frames.
         window: steps of the window of ``savgol``.
         order: order of the polynomial of ``savgol``.
         camera: column of the frames; by default the first camera.

@@ -180,7 +180,7 @@ def _extents(derived: Sequence[Derived]) -> dict[str, float]:
             extent[:] = np.delete(extent, motion.angles).max(initial=0.0)
         for name, own, column in zip(part.names, extent, part.position.T, strict=True):
             extents.setdefault(name, []).append(own)
-            values[name] = np.unique([*values.get(name, ()), *column])[:3]
+            values[name] = np.unique(np.append(values.get(name, []), column))[:3]
     return {name: float(np.mean(some)) for name, some in extents.items() if len(values[name]) > 2}
 
 

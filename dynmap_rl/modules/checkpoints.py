@@ -14,9 +14,7 @@ from .normalization import Normalizer
 from .policy import FeedforwardPolicy, RecurrentPolicy
 from .world_model import WorldModel
 
-MOST_CAMERAS = (
-    16  # of a checkpoint, which may be from elsewhere: each has an encoder and a decoder of its own
-)
+MOST_CAMERAS = 16  # of a file from elsewhere: each has an encoder and a decoder of its own
 POLICIES = {policy.kind: policy for policy in (FeedforwardPolicy, RecurrentPolicy)}
 
 
@@ -91,9 +89,8 @@ def save_world_model(folder: Path, model: WorldModel) -> None:
         "image_size": model.image_size,
         "cameras": model.cameras,
     }
-    save_weights(
-        Path(folder) / "weights.safetensors", model
-    )  # first: arguments alone would be a damaged checkpoint
+    # Weights first: arguments alone would be a damaged checkpoint.
+    save_weights(Path(folder) / "weights.safetensors", model)
     write_json(Path(folder) / "arguments.json", arguments)
 
 
@@ -162,13 +159,7 @@ def load_policy(folder: Path) -> FeedforwardPolicy | RecurrentPolicy:
 def _read_arguments(folder: Path) -> dict:
     path = Path(folder) / "arguments.json"
     if not path.exists():
-        seeds = sorted(
-            p.parent.parent.name for p in Path(folder).parents[1].glob("seed_*/policy/arguments.json")
-        )
-        there = f", but one in {', '.join(seeds)}" if seeds else ""
-        raise ValueError(
-            f"no checkpoint in {folder} (no arguments.json){there}; check the path, or train one"
-        )
+        raise ValueError(f"no checkpoint in {folder} (no arguments.json); check the path, or train one")
     return read_json(path)
 
 

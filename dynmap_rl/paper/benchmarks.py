@@ -30,14 +30,15 @@ FRAMES = {  # rows with other frames: arguments of the task
     "RGB+[P+V], two cameras": ":cameras=2",
 }
 COLORS = {"FetchPush": {"colors": ["#1c1c1c"], "threshold": 24}}  # of the object, where it has one of its own
+SUPERVISED = "decoupled", ("--world_model.supervision", "position,velocity")
 METHODS = {  # by the row of the table: recipe and its options
     "Only-RGB": ("decoupled", ("--world_model.supervision", "none")),
     "RGB+[P]": ("decoupled", ("--world_model.supervision", "position")),
-    "RGB+[P+V]": ("decoupled", ("--world_model.supervision", "position,velocity")),
-    **{row: ("decoupled", ("--world_model.supervision", "position,velocity")) for row in DERIVED},
+    "RGB+[P+V]": SUPERVISED,
+    **dict.fromkeys(DERIVED, SUPERVISED),
     "RGB+[P+V], ResNet-18": ("decoupled", ("--world_model.architecture", "resnet18")),
     "RGB+[P+V], ViT": ("decoupled", ("--world_model.architecture", "vit")),
-    **{row: ("decoupled", ("--world_model.supervision", "position,velocity")) for row in FRAMES},
+    **dict.fromkeys(FRAMES, SUPERVISED),
     "RGB+[P+V], Joint": ("joint", ()),
     "End-to-End": ("end_to_end", ()),
     "ACT": ("baseline", ("--policy", "act")),

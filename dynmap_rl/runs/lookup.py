@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from dynmap_rl.envs.protocol import BaseTask
 from dynmap_rl.modules.actor import Actor
 from dynmap_rl.modules.checkpoints import load_policy, load_world_model
 from dynmap_rl.modules.world_model import WorldModel
@@ -56,9 +57,30 @@ def load_actor(run: str | Path, seed: int = 0) -> Actor:
         ValueError: the run has no policy of that seed.
     """
     run = find_run(run)
+    seeds = sorted(folder.parent.name for folder in run.glob("seed_*/policy"))
+    if seeds and f"seed_{seed}" not in seeds:
+        raise ValueError(
+            f"{run} must have a policy in seed_{seed}, got {', '.join(seeds)}; choose one of these"
+        )
     own = run / f"seed_{seed}" / "world_model"  # joint training has a world model for each seed
     world_model = load_world_model(own if own.exists() else run / "world_model")
     return Actor(world_model, load_policy(run / f"seed_{seed}" / "policy"), mixed=True)
+
+
+def check_actions(world_model: WorldModel, origin: dict[str, str], task: BaseTask, run: str | Path) -> None:
+    """Check that a world model can be used on a task.
+
+    Args:
+        world_model: world model of a run.
+        origin: its origin (see :func:`load_world_model_of`).
+        task: the task.
+        run: the run, for the message.
+
+    Raises:
+        ValueError: it is of a robot dataset, or of a task with other actions.
+    """
+    if "task" not in origin or world_model.transition.action.size != len(task.layout.action_limit):
+        raise ValueError(f"--pretrained must be of a task with the actions of {task.name}, got {run}")
 
 
 def load_world_model_of(run: str | Path) -> tuple[WorldModel, dict[str, str]]:

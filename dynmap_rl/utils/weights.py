@@ -17,9 +17,8 @@ from .files import write_bytes
 def save_weights(path: Path, module: nn.Module) -> None:
     """Write a module's state as safetensors, atomically."""
     # Clones, as two names of one tensor are refused.
-    write_bytes(
-        path, save({k: v.detach().cpu().contiguous().clone() for k, v in module.state_dict().items()})
-    )
+    state = {name: value.detach().cpu().contiguous().clone() for name, value in module.state_dict().items()}
+    write_bytes(path, save(state))
 
 
 def load_module[Module: nn.Module](path: Path, make: Callable[[], Module]) -> Module:
