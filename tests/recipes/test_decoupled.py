@@ -86,7 +86,7 @@ def test_policies_on_a_world_model_of_another_run(small):
 
 def options(pretrained):
     """Return options that undo the preset's sizes of the world model, which have no effect with ``--pretrained``."""
-    sizes = ("updates", "windows", "window_steps", "rgb_frames")
+    sizes = ("updates", "windows", "window_steps")
     defaults = (f"--world_model.{name}={getattr(WorldModelTraining(), name)}" for name in sizes)
     return ["--pretrained", pretrained, *defaults]
 

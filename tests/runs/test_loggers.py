@@ -5,6 +5,7 @@ import importlib
 import json
 import sqlite3
 import sys
+import time
 from unittest import mock
 
 import pytest
@@ -88,7 +89,11 @@ def test_weights_and_biases_writes_the_run_without_a_network(tmp_path, monkeypat
     loggers._open("wandb", tmp_path / "run").experiment.finish()
     run_id = (tmp_path / "run/wandb/id").read_text()
     [path] = (tmp_path / "run/wandb").glob(f"offline-run-*/run-{run_id}.wandb")
-    records = read_wandb(path)
+    for _ in range(120):  # wandb's service writes the file's end up to a moment after ``finish``
+        records = read_wandb(path)
+        if any(record.HasField("exit") for record in records):
+            break
+        time.sleep(0.5)
     [opened] = [record.run for record in records if record.HasField("run")]
     assert (opened.project, opened.display_name) == ("dynmap_rl", (tmp_path / "run").as_posix())
     rows = [

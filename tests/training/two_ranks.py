@@ -60,7 +60,7 @@ def train(folder: Path, windows: int) -> None:
     episodes = make_episodes(5)
     settings = replace(WORLD_MODEL, windows=windows)
     train_world_model(make_model(), episodes, folder / "world_model", settings, save_every=1)
-    some = replace(settings, labelled=0.5, beta_rgb=0.0)
+    some = replace(settings, labelled=0.5, beta_rgb=0.0, rgb_frames=WorldModelTraining.rgb_frames)
     train_world_model(make_model(), episodes, folder / "labelled", some, save_every=1)
     joint, end_to_end = JointTraining(**ALL, **SIZES), EndToEndTraining(**SIZES)
     for name, run, settings in (
