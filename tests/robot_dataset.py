@@ -60,5 +60,15 @@ def draw(position):
     return frame
 
 
+def read_column(root, column):
+    """Return a column of all files as float64 ``[rows, ...]``."""
+    import pyarrow.parquet as pq
+
+    tables = [
+        pq.read_table(path, columns=["index", column]) for path in sorted((root / "data").rglob("*.parquet"))
+    ]
+    return np.concatenate([np.array(t[column].to_pylist(), np.float64) for t in tables])
+
+
 if __name__ == "__main__":
     make_robot_dataset(sys.argv[1], np.random.default_rng(1).integers(30, 60, 30).tolist())

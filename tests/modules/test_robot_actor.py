@@ -231,6 +231,23 @@ def test_wrong_use_gets_one_clear_error():
         RobotActor(make_actor(), period=0)
 
 
+@pytest.mark.parametrize("ahead", [0.9, 1.1])
+def test_a_frame_may_be_taken_up_to_a_period_after_the_call(ahead):
+    robot = make_robot()
+    robot.observe(FRAMES[0], 0.0)
+    robot.act(0.0)
+    robot.observe(FRAMES[1], DT + ahead * DT)
+    if ahead < 1:
+        assert np.isfinite(robot.act(DT)).all()
+    else:
+        with pytest.raises(ValueError, match="one clock"):
+            robot.act(DT)
+
+
+def test_it_does_not_train():
+    assert not RobotActor(make_actor().train()).actor.training
+
+
 def test_it_needs_an_actor_with_delays():
     model = make_model()
     actor = Actor(model, make_policy(CONSTANTS, "feedforward", model, width=20))

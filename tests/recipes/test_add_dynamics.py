@@ -16,10 +16,9 @@ import pytest
 import robot_dataset
 import torch
 from commands import run
-from robot_dataset import CAMERA, FPS, make_robot_dataset
+from robot_dataset import CAMERA, FPS, make_robot_dataset, read_column
 
 from dynmap_rl.data import add_dynamics, load_robot_dataset
-from dynmap_rl.data.demonstrations import find_meta, load_dataset, load_demonstrations, load_meta
 from recipes.add_dynamics import Config, main
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "add_dynamics.py"
@@ -65,13 +64,6 @@ def open_with_lerobot(root):
         return LeRobotDataset("test/robot", root=root, video_backend="pyav")
 
 
-def read(root, column):
-    tables = [
-        pq.read_table(path, columns=["index", column]) for path in sorted((root / "data").rglob("*.parquet"))
-    ]
-    return np.concatenate([np.array(t[column].to_pylist(), np.float64) for t in tables])
-
-
 def test_lerobot_reads_it_and_nothing_else_has_changed(pair):
     before, after = map(open_with_lerobot, pair)
     assert len(after) == len(before) == sum(LENGTHS)
@@ -114,8 +106,8 @@ def test_files_of_frames_are_the_same(pair):
 
 
 def test_angles_are_unwrapped_and_episodes_do_not_mix(pair):
-    state = read(pair[0], "observation.state")
-    position, velocity, acceleration = (read(pair[1], f"dynamics.{q}") for q in QUANTITIES)
+    state = read_column(pair[0], "observation.state")
+    position, velocity, acceleration = (read_column(pair[1], f"dynamics.{q}") for q in QUANTITIES)
     assert np.abs(np.diff(state[:, 2])).max() > 6, "the angle jumps"
     borders = np.cumsum([0, *LENGTHS])
     for start, end in pairwise(borders):
@@ -136,7 +128,7 @@ def test_statistics_are_those_of_the_columns(pair):
     rows = pq.read_table(episodes).to_pylist()
     borders = np.cumsum([0, *LENGTHS])
     for quantity in QUANTITIES:
-        values = read(root, f"dynamics.{quantity}")
+        values = read_column(root, f"dynamics.{quantity}")
         check(stats[f"dynamics.{quantity}"], values)
         for i, row in enumerate(rows):
             prefix = f"stats/dynamics.{quantity}/"
@@ -158,84 +150,15 @@ def check(stats, values):
         assert (error <= 0.2 * spread + 1e-6).all(), name  # LeRobot's are those of a histogram
 
 
-def test_derived_dynamics_of_our_recordings_are_near_the_simulators(recording, tmp_path, capsys):
-    """Positions are known, velocities within a tenth, accelerations, which jump every step, roughly."""
-    settings = {"dataset": str(recording), "state": "dynamics.position", "angles": "2,5"}
-    main(Config(**settings, output=tmp_path / "derived", replace=True))
-    assert "velocity" in capsys.readouterr().out
-    truth, derived = load_dataset(recording), load_dataset(tmp_path / "derived")
-    assert set(truth.keys(True, True)) == set(derived.keys(True, True))
-    for quantity, bound in (("position", 1e-6), ("velocity", 0.12), ("acceleration", 0.7)):
-        a, b = truth["dynamics", quantity][..., :2], derived["dynamics", quantity][..., :2]
-        assert (a - b).abs().mean() < bound * a.abs().mean(), quantity
-    assert torch.equal(truth["pixels"], derived["pixels"])
-
-
 def test_positions_from_the_frames(videos, tmp_path):
     main(Config(dataset=str(videos[0]), output=tmp_path / "tracked", source="centroid"))
-    position, state = read(tmp_path / "tracked", "dynamics.position"), read(videos[0], "observation.state")
+    position, state = (
+        read_column(tmp_path / "tracked", "dynamics.position"),
+        read_column(videos[0], "observation.state"),
+    )
     assert open_with_lerobot(tmp_path / "tracked").meta.features["dynamics.position"]["names"] == ["x", "y"]
     error = np.abs(position - (state[:, :2] * [128, 96] - 0.5))
     assert np.median(error) < 1.5 and error.mean() < 4, "pixels; the place that is background is not found"
-
-
-def test_tracks_of_a_recording_are_in_its_units_and_it_stays_a_recording(recording, tmp_path, folder_of_runs):
-    """Cart and block to some mm and degrees, and their velocities by tracks and by flow to a part of their size."""
-    truth, velocities = load_dataset(recording)["dynamics"], {}
-    for source in ("tracks", "flow"):
-        main(Config(dataset=str(recording), output=tmp_path / source, source=source, replace=True))
-        found = load_dataset(tmp_path / source)["dynamics"]
-        error = (found["position"] - truth["position"]).abs().mean((0, 1))
-        assert error[[0, 1, 3, 4]].max() < 0.01 and error[[2, 5]].max() < 0.1
-        velocities[source] = found["velocity"]
-        error = (found["velocity"] - truth["velocity"]).abs().mean()
-        assert error < 0.7 * truth["velocity"].abs().mean()
-    assert not torch.equal(*velocities.values())
-    before, after = load_meta(recording), load_meta(tmp_path / "tracks")
-    assert after["episodes"] == before["episodes"] and "layout" not in after
-    assert after["normalization"]["action"] == before["normalization"]["action"]
-    flow, quality = (
-        json.loads((folder_of_runs / source / "quality.json").read_text()) for source in ("flow", "tracks")
-    )
-    assert quality["checks"]["agreement"]["good"] and quality["command"]
-    agreement = pytest.approx(quality["checks"]["agreement"]["value"])
-    assert flow["checks"]["agreement"]["value"] == agreement, "the same two velocities"
-    page = (folder_of_runs / "tracks/report.html").read_text()
-    assert f"derived columns: {quality['verdict']}" in page and page.count("data:image/") == 3
-
-
-@pytest.mark.parametrize(
-    ("settings", "names"),
-    [
-        ({"columns": "0,1,2", "angles": "2"}, ["cart_x", "cart_y", "cart_theta"]),
-        ({"source": "centroid"}, ["x", "y"]),
-    ],
-)
-def test_a_recording_with_fewer_entries_loads_with_constants_of_their_own(
-    recording, tmp_path, settings, names
-):
-    main(Config(dataset=str(recording), output=tmp_path / "few", replace=True, **settings))
-    episodes, constants = load_demonstrations(tmp_path / "few")
-    assert episodes["train"]["dynamics", "velocity"].shape == (4, 120, len(names))
-    assert len(constants["velocity"]["low"]) == len(names)
-    assert load_meta(tmp_path / "few")["layout"]["position"] == names
-
-
-def test_entries_that_are_no_bodies_end_a_recording(recording, tmp_path):
-    main(Config(dataset=str(recording), output=tmp_path / "angle", replace=True, columns="2", angles="2"))
-    assert find_meta(tmp_path / "angle") is None
-
-
-def test_noise_is_seeded_and_has_the_given_size(recording, tmp_path):
-    settings = {"dataset": str(recording), "state": "dynamics.position", "angles": "2,5", "replace": True}
-    found = []
-    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
-        noise = {"noise": 0.005, "angle_noise": 0.02, "noise_seed": seed}
-        main(Config(**settings, **noise, output=tmp_path / name))
-        found.append(read(tmp_path / name, "dynamics.position"))
-    assert np.array_equal(found[0], found[1]) and not np.array_equal(found[0], found[2])
-    error = (found[0] - read(recording, "dynamics.position")).std(0)
-    assert np.allclose(error, [0.005, 0.005, 0.02] * 2, rtol=0.15)
 
 
 def test_one_entry_is_a_column_of_numbers(images, tmp_path):
@@ -263,7 +186,7 @@ def test_state_and_tracks_stand_side_by_side_and_are_judged_together(videos, tmp
     assert done.returncode == 0, done.stderr
     features = json.loads((output / "meta/info.json").read_text())["features"]
     assert features["dynamics.velocity"]["names"] == ["x", "y", "object1_x", "object1_y"]
-    position, velocity = read(output, "dynamics.position"), read(output, "dynamics.velocity")
+    position, velocity = read_column(output, "dynamics.position"), read_column(output, "dynamics.velocity")
     pixels = np.array([128, 96])
     assert np.abs(position[:, 2:] - pixels * position[:, :2]).max() < 2
     assert np.corrcoef(velocity[:, 2], velocity[:, 0])[0, 1] > 0.95  # squares are drawn at whole pixels
@@ -288,43 +211,13 @@ def test_entries_of_an_object_that_is_hidden_are_not_labels(monkeypatch, tmp_pat
     assert info["dtype"] == "bool" and info["names"] == ["x", "y", "object1_x", "object1_y"]
     hidden = np.zeros((sum(LENGTHS), 4), dtype=bool)
     hidden[10:14, 2:] = True
-    assert np.array_equal(read(tmp_path / "both", "dynamics.found").astype(bool), ~hidden)
+    assert np.array_equal(read_column(tmp_path / "both", "dynamics.found").astype(bool), ~hidden)
     episodes, _ = load_robot_dataset(tmp_path / "both", min_steps=24, image_size=32)
     pieces = torch.cat(list(episodes.values()))
     assert pieces["labelled"].dtype == torch.bool and 0 < (~pieces["labelled"]).sum() <= 2 * 8
     assert open_with_lerobot(tmp_path / "both")[12]["dynamics.found"].tolist() == [True, True, False, False]
     add_dynamics(tmp_path / "both", tmp_path / "again", columns=[0, 1], replace=True)
-    assert read(tmp_path / "again", "dynamics.found").all(), "nothing is left of the tracks"
-
-
-def test_trainings_of_the_tasks_leave_out_what_was_not_found(recording, tmp_path):
-    add_dynamics(recording, tmp_path / "tracked", source="tracks", replace=True)
-    for path in (tmp_path / "tracked/data").rglob("*.parquet"):
-        table = pq.read_table(path)
-        found = np.array(table["dynamics.found"].to_pylist())
-        found[::7, 3:] = False
-        place = table.column_names.index("dynamics.found")
-        column = pa.FixedSizeListArray.from_arrays(pa.array(found.ravel()), 6)
-        pq.write_table(table.set_column(place, "dynamics.found", column), path)
-    found = read(tmp_path / "tracked", "dynamics.found")
-    assert not found.all()
-    episodes = load_dataset(tmp_path / "tracked")
-    assert np.array_equal(episodes["labelled"].flatten(0, 1).numpy(), found)
-    splits, _ = load_demonstrations(tmp_path / "tracked")
-    labelled = torch.cat([splits[name]["labelled"] for name in ("train", "eval")])
-    assert np.array_equal(labelled.flatten(0, 1).numpy(), found)
-
-
-def test_tracks_are_cart_and_block_in_their_order_alone(recording, tmp_path):
-    output = tmp_path / "tracked"
-    add_dynamics(recording, output, source="tracks", sort="largest", replace=True)
-    info = json.loads((output / "meta/info.json").read_text())
-    assert info["features"]["dynamics.position"]["names"][0] == "object1_x"
-
-
-def test_the_picture_of_a_recording_is_a_metre_wide(recording, tmp_path):
-    with pytest.raises(ValueError, match="--width must be 1"):
-        add_dynamics(recording, tmp_path / "tracked", source="tracks", replace=True, width=2.0)
+    assert read_column(tmp_path / "again", "dynamics.found").all(), "nothing is left of the tracks"
 
 
 def test_files_beside_the_output_stay(images, tmp_path):
@@ -333,68 +226,6 @@ def test_files_beside_the_output_stay(images, tmp_path):
     (other / "thesis.tex").touch()
     main(Config(dataset=str(images[0]), output=tmp_path / "output"))
     assert (other / "thesis.tex").exists()
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"state": "observation.nothing"}, "observation.nothing"),
-        ({"columns": "0,4"}, "--columns"),
-        ({"columns": "a"}, "--columns.*'a'"),
-        ({"columns": "0,1", "angles": "2"}, "--angles"),
-        ({"method": "spline"}, "--method"),
-        ({"method": "savgol", "window": 4}, "--window"),
-        ({"method": "savgol", "window": 25}, "24"),
-        ({"source": "centroid", "camera": "front"}, "--camera .*observation.images.top.*'front'"),
-        ({"dataset": "no/where/here"}, "no/where/here"),
-        ({"dataset": None}, "--dataset"),
-        ({"source": "tracks", "columns": "0"}, "--columns has no effect with --source tracks"),
-        ({"camera": "observation.images.top"}, "--camera has no effect with --source state"),
-        ({"source": "radar"}, "--source .*'radar'"),
-        ({"source": "tracks", "objects": 0}, "--objects"),
-        ({"source": "centroid", "objects": 2}, "--objects has no effect with --source centroid"),
-        ({"source": "tracks", "colors": ""}, "--colors"),
-        ({"source": "centroid", "sort": "largest"}, "--sort has no effect with --source centroid"),
-        ({"source": "tracks", "colors": "red,#ff0000"}, "--colors must be a different colour"),
-        ({"source": "tracks", "colors": "#c81e1e00"}, "--colors"),
-        ({"source": "tracks", "noise_seed": 1}, "--noise_seed has no effect"),
-        ({"source": "tracks", "threshold": 0}, "--threshold"),
-        ({"source": "tracks", "colors": "redd"}, "--colors .*'redd'"),
-        ({"source": "tracks", "colors": "lime"}, "#00ff00"),
-        ({"source": "tracks", "colors": "red", "objects": 1}, "--objects .* no effect with --colors"),
-        ({"colors": "red"}, "--colors has no effect with --source state"),
-        ({"source": "state,tracks", "columns": "0,4"}, "--columns"),
-        ({"source": "tracks", "sort": "oldest"}, "--sort .*'oldest'"),
-        ({"source": "tracks", "noise": 0.1}, "--noise has no effect"),
-        ({"source": "tracks", "width": -1.0}, "--width"),
-        ({"source": "tracks", "width": float("inf")}, "--width"),
-        ({"source": "tracks", "objects": 300}, "--objects"),
-        ({"noise": -1.0}, "--noise"),
-        ({"noise": float("nan")}, "--noise"),
-        ({"angles": "2", "period": 0.0}, "--period must be above 0"),
-        ({"angles": "2", "period": 1.0}, "--period 360 for degrees"),
-        ({"window": 21}, "--window has no effect with --method central"),
-        (
-            {"source": "tracks", "method": "central", "order": 4},
-            "--order has no effect with --method central",
-        ),
-        ({"period": 360.0}, "--period has no effect with a state without --angles"),
-    ],
-)
-def test_bad_input_is_refused_before_anything_is_written(images, tmp_path, settings, message):
-    with pytest.raises(ValueError, match=message):
-        main(Config(**({"dataset": str(images[0]), "output": tmp_path / "bad"} | settings)))
-    assert not any(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("name", ["stats.json", "episodes/chunk-000/file-000.parquet"])
-def test_a_damaged_file_is_named_and_nothing_is_left(images, tmp_path, name):
-    shutil.copytree(images[0], tmp_path / "damaged")
-    path = tmp_path / "damaged/meta" / name
-    path.write_bytes(path.read_bytes()[:50])
-    with pytest.raises(ValueError, match=name):
-        main(Config(dataset=str(tmp_path / "damaged"), output=tmp_path / "new"))
-    assert [path.name for path in tmp_path.iterdir()] == ["damaged"]
 
 
 def test_a_copy_holds_what_links_lead_to_and_no_notes_of_file_managers(videos, tmp_path):
@@ -438,7 +269,7 @@ def test_numbers_that_are_not_used_may_be_missing(images, tmp_path):
     root = spoil(shutil.copytree(images[1], tmp_path / "old"), "dynamics.velocity", 3, 1)
     found = add_dynamics(root, tmp_path / "new", columns=[0, 1, 2], angles=[2], replace=True)
     assert found["differences"].keys() == {"position", "acceleration"}
-    assert np.isfinite(read(tmp_path / "new", "dynamics.velocity")).all()
+    assert np.isfinite(read_column(tmp_path / "new", "dynamics.velocity")).all()
 
 
 def test_a_dataset_is_complete_without_its_page(images, tmp_path, monkeypatch, capsys):
