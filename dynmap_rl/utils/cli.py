@@ -95,6 +95,7 @@ def parse_settings(config_class: type, arguments: Sequence[str]):
         if "--help" in arguments:
             _complete_help(options.parser, config_class)
             options.parser.set_defaults(**flatten(settings))  # draccus would show those of the nested classes
+            arguments = ["--help"]  # not the options before it, which draccus would refuse now
         return options.parse_args(arguments)
 
 

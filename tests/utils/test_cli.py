@@ -80,6 +80,13 @@ def test_the_help_shows_the_defaults_that_apply(run, capsys):
     assert __doc__ in lines and "--debug" in lines
 
 
+@pytest.mark.parametrize("arguments", [("--color", "blue", "--help"), ("--help", "--color", "blue")])
+def test_the_help_is_shown_beside_other_options(run, capsys, arguments):
+    with pytest.raises(SystemExit) as stopped:
+        run(*arguments)
+    assert not stopped.value.code and capsys.readouterr().out.startswith("usage:")
+
+
 def test_the_help_lists_no_option_that_is_refused(run, capsys):
     with pytest.raises(SystemExit):
         run("--help")
