@@ -31,6 +31,7 @@ class Settings:
     dry_run: bool = False
     output: Path | None = None
     color: str = "red"
+    policy: str | None = None
     first: Group = Group()
     second: Group = Group(rate=0.5)
 
@@ -80,7 +81,7 @@ def test_the_help_shows_the_defaults_that_apply(run, capsys):
     assert __doc__ in lines and "--debug" in lines
 
 
-@pytest.mark.parametrize("arguments", [("--color", "blue", "--help"), ("--help", "--color", "blue")])
+@pytest.mark.parametrize("arguments", [("--policy", "run", "--help"), ("--help", "--policy", "run")])
 def test_the_help_is_shown_beside_other_options(run, capsys, arguments):
     with pytest.raises(SystemExit) as stopped:
         run(*arguments)
