@@ -3,6 +3,7 @@
     python recipes/add_dynamics.py --dataset user/name --columns 0,1,2 --angles 2 --output datasets/name
     python recipes/add_dynamics.py --dataset user/name --source tracks --objects 2 --output datasets/name
     python recipes/add_dynamics.py --dataset user/name --source state,tracks --colors red --output datasets/name
+    python recipes/add_dynamics.py --dataset user/name --source tracks --colors red --preview 3     # writes no dataset
     python recipes/add_dynamics.py --dataset datasets/balance_reaching --source tracks --replace --output datasets/tracks
 
 World models are supervised on the columns dynamics.position, .velocity and .acceleration (see recipes/robot.py). The
@@ -25,8 +26,10 @@ class Config:
 
     # Dataset: a folder or a hub id. Required.
     dataset: str | None = None
-    # Folder of the new dataset. Required.
+    # Folder of the new dataset. Required without --preview.
     output: Path | None = None
+    # Number of episodes, the first ones, to derive and judge without writing a dataset.
+    preview: int | None = None
     # Source of the positions: state (a column), or the frames: centroid (of all that moves), tracks (objects with angles)
     # or flow (tracks, with velocities by optical flow), or both: state,tracks or state,flow. Limits:
     # dynmap_rl/data/README.md.
@@ -77,12 +80,13 @@ def main(config: Config) -> None:
     from dynmap_rl.data.format.reading import find_dataset
     from dynmap_rl.data.quality import quality_text, worst_episode
     from dynmap_rl.reporting.dataset_page import write_dataset_page
+    from dynmap_rl.reporting.html import write_html
     from dynmap_rl.reporting.track_figure import plot_tracks
     from dynmap_rl.runs.folder import plain_settings
     from dynmap_rl.utils.files import write_json
 
-    if not config.dataset or not config.output:
-        raise ValueError("--dataset and --output must be given: the dataset, and the folder of the new one")
+    if not config.dataset:
+        raise ValueError("--dataset must be given: a folder or a hub id")
     of_state = "state", "columns", "angles", "period", "noise", "angle_noise", "noise_seed"
     of_frames = "camera", "objects", "colors", "threshold", "sort", "point", "width"
     unused = {"state": of_frames, "tracks": of_state, "flow": of_state}
@@ -98,18 +102,20 @@ def main(config: Config) -> None:
         "colors": config.colors.split(",") if config.colors is not None else None,
     }
     found = add_dynamics(**settings)
-    print(f"written: {config.output}")
-    if find_meta(find_dataset(config.dataset)) and not find_meta(config.output):
-        print(
-            "its dynamics are not those of its task: train with recipes/robot.py, not with recipes/decoupled.py"
-        )
+    if config.output:
+        print(f"written: {config.output}")
+        if find_meta(find_dataset(config.dataset)) and not find_meta(config.output):
+            print(
+                "its dynamics are not those of its task: train with recipes/robot.py, not with recipes/decoupled.py"
+            )
     lines = []
     for quantity, difference in found["differences"].items():
         entries = ", ".join(f"{value:.3g}" for value in difference)
         lines.append(f"mean absolute difference from the replaced {quantity}: {entries}")
     text = "\n".join([quality_text(found["quality"]), *lines])
     print(text)
-    folder = Path("runs/add_dynamics") / config.output.name
+    name = config.output.name if config.output else f"{Path(config.dataset).name}_preview"
+    folder = Path("runs/add_dynamics") / name
     command = command_line(sys.argv)
     differences = {q: difference.tolist() for q, difference in found["differences"].items()}
     try:
@@ -121,7 +127,10 @@ def main(config: Config) -> None:
             plot_tracks(config.dataset, found["view"], worst_episode(found["quality"]), folder / "tracks.png")
     except OSError as error:  # the dataset is complete
         return print(f"no page in {folder}: {error}")
-    return write_dataset_page(folder, config.output, plain_settings(config), command, text)
+    if config.output:
+        return write_dataset_page(folder, config.output, plain_settings(config), command, text)
+    title = f"{config.dataset}, the first {config.preview} episodes"
+    return print(f"written: {write_html(folder, title, text, command, plain_settings(config))}")
 
 
 if __name__ == "__main__":

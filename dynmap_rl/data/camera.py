@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -132,13 +132,16 @@ def _parse_color(text: str) -> tuple[int, int, int]:
     return red, green, blue
 
 
-def read_motion(root: Path, info: dict, camera: FrameSource) -> Iterator[tuple[int, Motion]]:
+def read_motion(
+    root: Path, info: dict, camera: FrameSource, only: Collection[int] | None = None
+) -> Iterator[tuple[int, Motion]]:
     """Iterate over the episodes' motions as a camera sees them.
 
     Args:
         root: folder of the dataset.
         info: content of its ``meta/info.json``.
         camera: source and its settings.
+        only: the episodes that are read; by default all.
 
     Raises:
         ValueError: a file is damaged, or what should be tracked is not found; the message names the episode.
@@ -146,8 +149,9 @@ def read_motion(root: Path, info: dict, camera: FrameSource) -> Iterator[tuple[i
     table, failed = read_table(root, info, ["timestamp"]), {}
     time = read_column(root, info, table, "timestamp", np.float64).numpy()[:, 0]
     rows = dict(spans(table["episode_index"].to_numpy()))
-    episodes = iterate_frames(root, info, camera.column, widest=WIDEST)
-    for episode, frames, factor in tqdm(episodes, "tracking", info.get("total_episodes"), leave=False):
+    episodes = iterate_frames(root, info, camera.column, widest=WIDEST, only=only)
+    count = info.get("total_episodes") if only is None else len(only)
+    for episode, frames, factor in tqdm(episodes, "tracking", count, leave=False):
         try:
             yield episode, measure(frames, factor, camera, time[rows[episode]])
         except ValueError as error:

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import math
 from collections.abc import Iterable, Sequence
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +31,7 @@ SOURCES = "state", "centroid", "tracks", "flow", "state,tracks", "state,flow"
 
 def add_dynamics(
     dataset: str | Path,
-    output: str | Path,
+    output: str | Path | None = None,
     source: str = "state",
     state: str = "observation.state",
     columns: Iterable[int] | None = None,
@@ -50,6 +51,7 @@ def add_dynamics(
     point: bool = False,
     width: float | None = None,
     replace: bool = False,
+    preview: int | None = None,
 ) -> dict:
     """Copy a LeRobot v3.0 dataset and add the columns ``dynamics.position``, ``.velocity`` and ``.acceleration``.
 
@@ -62,7 +64,7 @@ def add_dynamics(
 
     Args:
         dataset: local folder or hub id.
-        output: the new folder.
+        output: the new folder; None with ``preview``.
         source: ``state``, or from the frames ``centroid``, ``tracks`` or ``flow`` (see
             :class:`dynmap_rl.data.camera.FrameSource`), or both: ``state,tracks`` or ``state,flow``.
         state: column whose entries are positions. They stay as measured, except for unwrapped angles.
@@ -86,6 +88,8 @@ def add_dynamics(
         point: leave the angles of tracked objects out.
         width: width of the picture (m); by default 1 for a task in the plane, otherwise positions are in pixels.
         replace: replace existing dynamics columns.
+        preview: number of episodes, the first ones, that are derived and judged without writing a dataset; by default all
+            episodes are, and the dataset is written.
 
     Returns:
         ``differences``, the mean absolute difference from replaced columns, ``[D]`` by quantity; ``quality`` (see
@@ -95,25 +99,38 @@ def add_dynamics(
         ValueError: an argument is wrong, or the dataset is damaged or does not allow it.
         OSError: the folder cannot be written.
     """
-    root, output = find_dataset(dataset), Path(output).expanduser()
+    if (output is None) == (preview is None):
+        raise ValueError(
+            "one of --output and --preview must be given: the folder of the new dataset, or a number of episodes"
+        )
+    if preview is not None and preview < 1:
+        raise ValueError(f"--preview must be at least 1 episode, got {preview}")
+    root = find_dataset(dataset)
     info, meta = read_info(root), find_meta(root)
     old = [name for q in DYNAMICS if (name := f"dynamics.{q}") in info["features"]]
     if old and not replace:
         raise ValueError(f"{root} must not have {', '.join(old)}; replace them with --replace")
-    _check_output(root, output)
+    if output is not None:
+        output = _check_output(root, Path(output).expanduser())
     if source not in SOURCES:
         raise ValueError(f"--source must be one of {', '.join(map(repr, SOURCES))}, got {source!r}")
     check_method(method or ("central" if source == "state" else "savgol"), window, order)
+    table = read_table(root, info, ["timestamp", *old])
+    rows = dict(islice(spans(table["episode_index"].to_numpy()), preview))
+    time = read_column(root, info, table, "timestamp", np.float64).numpy()[
+        : max(own.stop for own in rows.values()), 0
+    ]
     planar = meta is not None and _is_planar(meta["task"])
     parts, entries, view = [], None, None  # names, motions by episode, and method
     if "state" in source:
         entries = choose_state(info, state, columns, angles, period, noise, angle_noise, noise_seed)
-        parts.append((entries.names, read_state(root, info, entries), method or "central"))
+        motions = islice(read_state(root, info, entries), preview)
+        parts.append((entries.names, motions, method or "central"))
     if source != "state":
         frames = {"camera": camera, "objects": objects, "colors": colors, "threshold": threshold}
         frames |= {"sort": sort, "point": point, "width": width}
         view = choose_view(root, info, source.removeprefix("state,"), planar, **frames)
-        parts.append((view.names, read_motion(root, info, view), method or "savgol"))
+        parts.append((view.names, read_motion(root, info, view, preview and list(rows)), method or "savgol"))
     names = [name for part in parts for name in part[0]]
     ordered = view and view.sort == "lowest" and not view.colors  # the cart is below the block
     if planar and ordered and view.names == FrameSource("tracks", "", len(BODIES) // 3).names == names:
@@ -123,29 +140,29 @@ def add_dynamics(
         raise ValueError(
             f"names of the dynamics must be different, got {', '.join(names)}; take other --columns"
         )
-    table = read_table(root, info, ["timestamp", *old])
-    time = read_column(root, info, table, "timestamp", np.float64).numpy()[:, 0]
-    rows = dict(spans(table["episode_index"].to_numpy()))
     _check_times(root, time, rows, [part[2] for part in parts], window)
-    with new_folder(output) as folder:
+    with new_folder(output) if output else contextlib.nullcontext() as folder:
         values, seen, derived = _derive_parts(root, parts, time, rows, window, order)
-        new = {f"dynamics.{q}": v.astype(np.float32) for q, v in values.items()}
-        if view or FOUND in info["features"]:
-            new[FOUND] = seen
         differences = {}
         for name in old:
             quantity = name.removeprefix("dynamics.")
             with contextlib.suppress(ValueError):  # damaged columns may be replaced too
-                before = read_column(root, info, table, name, np.float64).numpy()
+                before = read_column(root, info, table, name, np.float64).numpy()[: len(time)]
                 if before.shape == values[quantity].shape:
                     differences[quantity] = np.abs(values[quantity] - before).mean(0)
         quality = judge_quality(derived)
+        found = {"differences": differences, "quality": quality, "view": view}
+        if not folder:
+            return found
+        new = {f"dynamics.{q}": v.astype(np.float32) for q, v in values.items()}
+        if view or FOUND in info["features"]:
+            new[FOUND] = seen
         how = {"source": source, "methods": [part[2] for part in parts], "window": window, "order": order}
         how |= {"state": entries and dataclasses.asdict(entries), "frames": view and dataclasses.asdict(view)}
         how |= quality | {"differences": {q: d.tolist() for q, d in differences.items()}}
         meta = _describe(meta, planar, names, values, rows) if meta else None
         write_columns(root, folder, info, table, new, names, {META: meta, DERIVED: how})
-    return {"differences": differences, "quality": quality, "view": view}
+    return found
 
 
 def _derive_parts(
@@ -240,10 +257,12 @@ def _describe(
     return rest | layout | {"normalization": meta["normalization"] | ranges}
 
 
-def _check_output(root: Path, output: Path) -> None:
+def _check_output(root: Path, output: Path) -> Path:
+    """Return the folder, which must be new and outside of the dataset."""
     if output.exists():
         raise ValueError(
             f"--output must be a new folder, got {output}, which exists; choose another or delete it"
         )
     if output.resolve().is_relative_to(root.resolve()):
         raise ValueError(f"--output must be outside of the dataset, got {output}; choose another")
+    return output

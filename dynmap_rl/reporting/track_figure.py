@@ -28,7 +28,7 @@ def plot_tracks(dataset: str | Path, view: FrameSource, episode: int, path: Path
         path: file to write.
     """
     root = find_dataset(dataset)
-    _, frames, _ = next(iterate_frames(root, read_info(root), view.column, widest=WIDEST, only=episode))
+    _, frames, _ = next(iterate_frames(root, read_info(root), view.column, widest=WIDEST, only=[episode]))
     tracks = track(frames, view)
     shown = np.linspace(0, len(frames) - 1, SHOWN).round().astype(int)
     figure, axes = plt.subplots(2, SHOWN // 2, figsize=(9, 5), layout="constrained")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -55,7 +55,7 @@ def iterate_frames(
     camera: str,
     size: tuple[int, int] | None = None,
     widest: int | None = None,
-    only: int | None = None,
+    only: Collection[int] | None = None,
 ) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
     """Iterate over the episodes' frames.
 
@@ -67,7 +67,7 @@ def iterate_frames(
         camera: column of the frames.
         size: width and height that frames are resized to, whatever their own aspect.
         widest: width that wider frames are reduced to, in place of ``size``.
-        only: the one episode that is read; by default all.
+        only: the episodes that are read; by default all.
 
     Yields:
         The episode's index, its frames uint8 ``[T, height, width, 3]`` (RGB), and the ratios of stored to returned width and
@@ -83,7 +83,7 @@ def iterate_frames(
     for file in sorted((root / "data").glob("*/*.parquet")):
         table = read_file(file, columns)
         for episode, span in spans(table["episode_index"].to_numpy()):
-            if only not in (None, episode):
+            if only is not None and episode not in only:
                 continue
             rows = table.slice(span.start, span.stop - span.start)
             blocks = (
