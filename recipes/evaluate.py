@@ -54,7 +54,7 @@ class Config:
     failures: bool = False
     # Device, with --policy, and cores.
     compute: Compute = Compute()
-    # JSON file of the result; by default eval.json beside the page.
+    # Another JSON file of the result, besides eval.json beside the page.
     output: Path | None = None
 
 
@@ -71,18 +71,18 @@ def main(config: Config) -> None:
     if config.policy:
         refuse(config, Config(), ["expert", "checkpoint"], "--policy")
     else:
-        names = "seed", "trust_remote_code", "delay", "jitter", "lost", "delay_error", "stale"
-        refuse(config, Config(), names, "an expert")
+        seen = "delay", "jitter", "lost", "delay_error", "stale"
+        refuse(config, Config(), ["seed", "trust_remote_code", *seen], "an expert")
+        refuse(config.compute, Compute(), ["device"], "an expert", "compute.")
     torch.set_num_threads(1)  # networks are small, and threads would wait for each other
     folder, text, result = (judge_policy if config.policy else judge_expert)(config)
     print(text)
     who = f"Policy {config.policy}" if config.policy else f"Expert {result['expert']}"
     command = command_line(sys.argv)
     write_html(folder, f"{who}, {result['task']}", text, command, plain_settings(config))
-    common = {"split": config.eval.split, "episodes": config.eval.episodes}
-    common |= {"command": command, "commit": find_commit()}
-    output = config.output or folder / "eval.json"
-    write_json(output, result | common)
+    result |= {"split": config.eval.split, "episodes": config.eval.episodes, "command": command}
+    for output in dict.fromkeys([folder / "eval.json", config.output or folder / "eval.json"]):
+        write_json(output, result | {"commit": find_commit()})
     print(f"written: {output}, {folder / 'report.html'}")
 
 

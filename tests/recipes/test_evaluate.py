@@ -125,6 +125,7 @@ def test_late_frames_bridged_or_stale(tmp_path, monkeypatch):
         (["--expert", "nobody"], "nobody"),
         (["--expert", "balance_reaching", "--seed", "1"], "--seed"),
         (["--expert", "careless", "--checkpoint", "iteration_001"], "--checkpoint has no effect"),
+        (["--expert", "careless", "--compute.device", "cuda"], "--compute.device has no effect"),
         (["--checkpoint", "iteration_999"], "iteration_999"),
         (["--eval.episodes", "0"], "episodes"),
         (["--eval.paper_episodes", "5"], "--eval.paper_episodes"),
