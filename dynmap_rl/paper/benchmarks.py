@@ -29,10 +29,7 @@ FRAMES = {  # rows with other frames: arguments of the task
     "RGB+[P+V], 96 pixels": ":image_size=96",
     "RGB+[P+V], two cameras": ":cameras=2",
 }
-COLORS = {  # of the object, where it has one of its own
-    "FetchPush": {"colors": ["#1c1c1c"], "threshold": 24},
-    "FetchSlide": {"colors": ["red"]},
-}
+COLORS = {"FetchPush": {"colors": ["#1c1c1c"], "threshold": 24}}  # of the object, where it has one of its own
 SUPERVISED = "decoupled", ("--world_model.supervision", "position,velocity")
 METHODS = {  # by the row of the table: recipe and its options
     "Only-RGB": ("decoupled", ("--world_model.supervision", "none")),
