@@ -114,7 +114,7 @@ def main(config: Config) -> None:
         lines.append(f"mean absolute difference from the replaced {quantity}: {entries}")
     text = "\n".join([quality_text(found["quality"]), *lines])
     print(text)
-    name = config.output.name if config.output else f"{Path(config.dataset).name}_preview"
+    name = config.output.name if config.output else f"{Path(config.dataset).resolve().name}_preview"
     folder = Path("runs/add_dynamics") / name
     command = command_line(sys.argv)
     differences = {q: difference.tolist() for q, difference in found["differences"].items()}
