@@ -114,8 +114,9 @@ def main(config: Config) -> None:
         lines.append(f"mean absolute difference from the replaced {quantity}: {entries}")
     text = "\n".join([quality_text(found["quality"]), *lines])
     print(text)
-    name = config.output.name if config.output else f"{Path(config.dataset).resolve().name}_preview"
-    folder = Path("runs/add_dynamics") / name
+    folder = Path("runs/add_dynamics_preview") / Path(config.dataset).resolve().name
+    if config.output:
+        folder = Path("runs/add_dynamics") / config.output.name
     command = command_line(sys.argv)
     differences = {q: difference.tolist() for q, difference in found["differences"].items()}
     try:
@@ -124,12 +125,14 @@ def main(config: Config) -> None:
         )
         (folder / "tracks.png").unlink(missing_ok=True)  # of another source
         if config.source.endswith(("tracks", "flow")):
-            plot_tracks(config.dataset, found["view"], worst_episode(found["quality"]), folder / "tracks.png")
+            view = found["view"]
+            episode = worst_episode(found["quality"], view.names)
+            plot_tracks(config.dataset, view, episode, folder / "tracks.png")
     except OSError as error:  # the dataset is complete
         return print(f"no page in {folder}: {error}")
     if config.output:
         return write_dataset_page(folder, config.output, plain_settings(config), command, text)
-    title = f"{config.dataset}, the first {config.preview} episodes"
+    title = f"{config.dataset}, preview of {found['episodes']} of the episodes"
     return print(f"written: {write_html(folder, title, text, command, plain_settings(config))}")
 
 

@@ -75,24 +75,25 @@ def main(config: Config) -> None:
         refuse(config, Config(), ["seed", "trust_remote_code", *seen], "an expert")
         refuse(config.compute, Compute(), ["device"], "an expert", "compute.")
     torch.set_num_threads(1)  # networks are small, and threads would wait for each other
-    folder, text, result = (judge_policy if config.policy else judge_expert)(config)
+    folder, text, result, draw = (judge_policy if config.policy else judge_expert)(config)
     print(text)
     who = f"Policy {config.policy}" if config.policy else f"Expert {result['expert']}"
     command = command_line(sys.argv)
-    write_html(folder, f"{who}, {result['task']}", text, command, plain_settings(config))
     result |= {"split": config.eval.split, "episodes": config.eval.episodes, "command": command}
     for output in dict.fromkeys([folder / "eval.json", config.output or folder / "eval.json"]):
         write_json(output, result | {"commit": find_commit()})
-    print(f"written: {output}, {folder / 'report.html'}")
+    draw(path=folder / "rollouts.gif")
+    page = write_html(folder, f"{who}, {result['task']}", text, command, plain_settings(config))
+    print(f"written: {output}, {page}")
 
 
 def name_folder(config: Config, *names: str) -> Path:
     """Return the folder of an evaluation."""
-    return Path("runs/evaluate") / "_".join([*names, config.eval.split]).replace("/", "")
+    return Path("runs/evaluate") / "_".join([*names, config.eval.split]).replace("/", "")[-255:]
 
 
-def judge_policy(config: Config) -> tuple[Path, str, dict]:
-    """Return the folder with an animation, the numbers as text, and the result with the outcome of every episode."""
+def judge_policy(config: Config) -> tuple:
+    """Return the folder, the numbers as text, the result with the outcome of every episode, and what draws a film."""
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.evaluation.protocol import evaluate
     from dynmap_rl.evaluation.statistics import summary_text
@@ -109,14 +110,19 @@ def judge_policy(config: Config) -> tuple[Path, str, dict]:
             raise ValueError("--policy must be a run for --delay; add --stale for a LeRobot policy")
         actor = DelayedActor(actor, max_delay=delay.longest)
     own = isinstance(actor, Actor | DelayedActor)
-    result = evaluate(actor, task, config.eval, delay, workers=config.compute.threads if own else 1)["test"]
     parts = [*Path(config.policy).parts, *([f"seed_{config.seed}"] if own else [])]
-    if delay:
-        parts += ["_".join(map(str, ["delay", *astuple(delay)])), *(["stale"] if config.stale else [])]
-        result |= {"delay": asdict(delay), "stale": config.stale}
+    parts += ["_".join(map(str, ["delay", *astuple(delay)])), *["stale"] * config.stale] if delay else []
+    late = {"delay": asdict(delay), "stale": config.stale} if delay else {}
     folder = name_folder(config, get_task(task).name, *parts)
-    film_policy(actor, task, result["rows"], folder / "rollouts.gif", delay, config.failures)
-    return folder, summary_text(result["summary"]), {"task": task, "policy": config.policy, **result}
+    folder.mkdir(parents=True, exist_ok=True)  # errors come before the evaluation
+    result = evaluate(actor, task, config.eval, delay, workers=config.compute.threads if own else 1)["test"]
+    draw = partial(film_policy, actor, task, result["rows"], delay=delay, failures=config.failures)
+    return (
+        folder,
+        summary_text(result["summary"]),
+        {"task": task, "policy": config.policy, **result, **late},
+        draw,
+    )
 
 
 def read_delay(config: Config):
@@ -126,9 +132,7 @@ def read_delay(config: Config):
     delay = FrameDelay(config.delay, config.jitter, config.lost, config.delay_error)
     if config.stale:
         refuse(config, Config(), ["delay_error"], "--stale, which does not read delays")
-    if delay == FrameDelay():
-        return refuse(config, Config(), ["stale"], "frames in time")
-    return delay
+    return delay if delay != FrameDelay() else refuse(config, Config(), ["stale"], "frames in time")
 
 
 def load_policy(config: Config, folder: Path, task):
@@ -142,7 +146,8 @@ def load_policy(config: Config, folder: Path, task):
         raise ValueError(f"--policy must be a run or a policy, got {config.policy}; see recipes/README.md")
     if has_world_model(folder):
         return load_actor(folder, config.seed).to(choose_device(config.compute.device))
-    if not Path(config.policy).expanduser().exists() and not config.trust_remote_code:
+    path = Path(config.policy).expanduser()
+    if not path.exists() and not config.trust_remote_code:
         raise ValueError(
             f"{config.policy} on the hub may name code to run; add --trust_remote_code to allow it"
         )
@@ -154,11 +159,11 @@ def load_policy(config: Config, folder: Path, task):
         ) from error
     refuse(config, Config(), ["seed"], "a LeRobot policy")
     torch.set_num_threads(config.compute.threads)
-    return LeRobotActor(config.policy, choose_device(config.compute.device), task)
+    return LeRobotActor(str(path), choose_device(config.compute.device), task)
 
 
-def judge_expert(config: Config) -> tuple[Path, str, dict]:
-    """Return the folder with an animation, the numbers as text, and the result: ``rates``, ``intervals`` (%), ``rows``."""
+def judge_expert(config: Config) -> tuple:
+    """Return folder, text, result and film as for a policy; the result has ``rates``, ``intervals`` (%) and ``rows``."""
     from dynmap_rl.envs.scene import scene_seeds
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.evaluation.experts import judge_demonstrator, list_outcomes
@@ -190,10 +195,10 @@ def judge_expert(config: Config) -> tuple[Path, str, dict]:
         for name, rate in rates.items()
     ]
     folder = name_folder(config, task.name, *Path(expert).parts[-4:], checkpoint)
-    draw(failures_first(seeds, outcomes["success"], alone=config.failures), folder / "rollouts.gif")
+    draw = partial(draw, failures_first(seeds, outcomes["success"], alone=config.failures))
     rows = {name: "".join("01"[bool(value)] for value in values) for name, values in outcomes.items()}
     result = {"task": config.task or task.name, "expert": expert, "checkpoint": checkpoint}
-    return folder, "\n".join(lines), result | {"rates": rates, "intervals": intervals, "rows": rows}
+    return folder, "\n".join(lines), result | {"rates": rates, "intervals": intervals, "rows": rows}, draw
 
 
 if __name__ == "__main__":

@@ -93,7 +93,8 @@ def add_dynamics(
 
     Returns:
         ``differences``, the mean absolute difference from replaced columns, ``[D]`` by quantity; ``quality`` (see
-        :func:`dynmap_rl.data.quality.judge_quality`); and ``view``, the camera with all defaults, None for a state.
+        :func:`dynmap_rl.data.quality.judge_quality`); ``view``, the camera with all defaults, None for a state; and
+        ``episodes``, their number.
 
     Raises:
         ValueError: an argument is wrong, or the dataset is damaged or does not allow it.
@@ -108,7 +109,7 @@ def add_dynamics(
     root = find_dataset(dataset)
     info, meta = read_info(root), find_meta(root)
     old = [name for q in DYNAMICS if (name := f"dynamics.{q}") in info["features"]]
-    if old and not replace:
+    if old and not replace and preview is None:
         raise ValueError(f"{root} must not have {', '.join(old)}; replace them with --replace")
     if output is not None:
         output = _check_output(root, Path(output).expanduser())
@@ -120,7 +121,7 @@ def add_dynamics(
     time = read_column(root, info, table, "timestamp", np.float64).numpy()[
         : max(own.stop for own in rows.values()), 0
     ]
-    planar = meta is not None and _is_planar(meta["task"])
+    planar = meta is not None and _is_planar(meta)
     parts, entries, view = [], None, None  # names, motions by episode, and method
     if "state" in source:
         entries = choose_state(info, state, columns, angles, period, noise, angle_noise, noise_seed)
@@ -151,7 +152,7 @@ def add_dynamics(
                 if before.shape == values[quantity].shape:
                     differences[quantity] = np.abs(values[quantity] - before).mean(0)
         quality = judge_quality(derived)
-        found = {"differences": differences, "quality": quality, "view": view}
+        found = {"differences": differences, "quality": quality, "view": view, "episodes": len(rows)}
         if not folder:
             return found
         new = {f"dynamics.{q}": v.astype(np.float32) for q, v in values.items()}
@@ -234,12 +235,16 @@ def _check_times(
         )
 
 
-def _is_planar(task: str) -> bool:
-    """Return whether a task that a dataset names is known and in the plane; a dataset must not run code."""
+def _is_planar(meta: dict) -> bool:
+    """Return whether the task of a recording is in the plane.
+
+    A dataset must not run code: a task whose module is not imported is in the plane if it has the states of cart and block.
+    """
     try:
-        return get_task(task, from_file=True).planar
+        return get_task(meta["task"], from_file=True).planar
     except ValueError:
-        return False
+        layout = find_layout(meta)
+        return dataclasses.replace(layout, position=LAYOUT.position, velocity=LAYOUT.velocity) == LAYOUT
 
 
 def _describe(

@@ -112,8 +112,11 @@ def judge_quality(derived: Sequence[Derived]) -> dict:
         for name, values in _measure(part, extents).items():
             row.setdefault(name, {}).update(values)
     tracked = [part for part in derived if part.motion.tracks and part.motion.found.shape[1] > 1]
-    for part, swapped in zip(tracked, _swapped([part.motion.tracks.color for part in tracked]), strict=True):
-        rows[part.episode]["order"] = {"objects": float(swapped)}
+    if len(tracked) > 2:  # two episodes of any colours may look alike
+        for part, swapped in zip(
+            tracked, _swapped([part.motion.tracks.color for part in tracked]), strict=True
+        ):
+            rows[part.episode]["order"] = {"objects": float(swapped)}
     checks = {}
     for name, (limit, more, what, advice) in LIMITS.items():
         found = [row[name] for row in rows.values() if row.get(name)]
@@ -224,8 +227,6 @@ def _swapped(colors: list[np.ndarray]) -> np.ndarray:
     """
     from scipy.optimize import linear_sum_assignment
 
-    if len(colors) < 3:  # two episodes of any colours may look alike
-        return np.zeros(len(colors), dtype=bool)
     given = np.array(colors, float)  # (E, N, 3)
     center = given[0]
     for _ in range(5):
@@ -271,12 +272,21 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
     return float((a * b).sum() / norm) if norm else 1.0
 
 
-def worst_episode(quality: dict) -> int:
-    """Return the episode in which the check that is farthest beyond its limit, or nearest to it, is worst."""
+def worst_episode(quality: dict, names: Sequence[str] = ()) -> int:
+    """Return the episode in which the check that is farthest beyond its limit, or nearest to it, is worst.
+
+    Args:
+        quality: result of :func:`judge_quality`.
+        names: entries of the tracked objects, whose checks alone count; by default all checks do.
+    """
+    checks = quality["checks"].items()
+    if names:
+        tracked = {"picture", "objects", *names, *(name.rpartition("_")[0] for name in names)}
+        checks = [(name, check) for name, check in checks if check["where"] in tracked]
 
     def excess(item: tuple[str, dict]) -> float:
         name, check = item
         ratio = check["value"] / check["limit"]
         return ratio if LIMITS[name][1] else 2 - ratio
 
-    return max(quality["checks"].items(), key=excess)[1]["episode"]
+    return max(checks, key=excess)[1]["episode"]

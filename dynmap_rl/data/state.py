@@ -71,10 +71,10 @@ def choose_state(
     if column not in vectors:
         raise ValueError(f"--state must be a column of numbers, one of {', '.join(vectors)}, got {column!r}")
     size = info["features"][column]["shape"][0]
-    columns = list(range(size) if columns is None else columns)
+    columns = list(map(int, range(size) if columns is None else columns))
     if not columns or len(set(columns)) < len(columns) or not all(0 <= i < size for i in columns):
         raise ValueError(f"--columns must be different entries of {column}, 0 to {size - 1}, got {columns}")
-    angles = list(angles)
+    angles = list(map(int, angles))
     if unknown := [i for i in angles if i not in columns]:
         raise ValueError(f"--angles must be among --columns {columns}, got {unknown}")
     names, places = entry_names(info, column), [columns.index(i) for i in angles]

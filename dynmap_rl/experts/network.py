@@ -154,4 +154,4 @@ def task_of_expert(expert: str | Path, task: Task) -> Task:
 def find_expert(expert: str | Path) -> Path:
     """Return the folder of an expert's checkpoints, shipped or named by its path."""
     shipped = CHECKPOINTS / expert
-    return shipped if shipped.is_dir() else Path(expert)
+    return shipped if shipped.is_dir() and shipped.parent == CHECKPOINTS else Path(expert).expanduser()

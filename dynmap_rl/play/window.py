@@ -114,7 +114,7 @@ class PlayWindow:
             session.driver = drivers[(drivers.index(session.driver) + 1) % len(drivers)]
 
     def _point(self, event) -> None:
-        pressed = event.type == pygame.MOUSEBUTTONDOWN or event.buttons[0]
+        pressed = event.button == 1 if event.type == pygame.MOUSEBUTTONDOWN else event.buttons[0]
         x, y = (event.pos[0] - MARGIN) / self.size, 1 - (event.pos[1] - MARGIN - LINE) / self.size
         if self.flat and pressed and 0 <= x <= 1 and 0 <= y <= 1:
             self.session.driver, self.session.person.target = "person", (x, y)

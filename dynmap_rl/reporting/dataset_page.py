@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dynmap_rl.data.format.frames import choose_camera, iterate_frames
+from dynmap_rl.data.format.frames import choose_camera, iterate_frames, list_cameras
 from dynmap_rl.data.format.reading import (
     find_dataset,
     read_column,
@@ -56,7 +56,7 @@ def _write_page(folder: Path, root: Path, settings: dict, command: str, said: st
     ]
     lines += [*said.splitlines(), "", *_ranges(root, info, quantities)]
     _plot_dynamics(root, info, quantities, folder / "dynamics.png")
-    if any(feature["dtype"] in ("image", "video") for feature in info["features"].values()):
+    if list_cameras(info):
         _film(root, info, choose_camera(root, info, settings.get("camera")), folder / "episodes.gif")
     return write_html(folder, f"Dataset {root.name}", "\n".join(lines), command, settings)
 

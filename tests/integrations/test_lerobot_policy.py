@@ -1,6 +1,7 @@
 """The LeRobot policy ``dynmap``: windows, losses, constants, control."""
 
 import dataclasses
+import json
 import shutil
 from types import SimpleNamespace
 
@@ -102,6 +103,15 @@ def test_the_loss_is_that_of_the_config(recording, supervision, kind, terms):
     assert set(parts) == {f"loss_{term}" for term in terms}
     assert loss.item() == pytest.approx(sum(parts.values()), rel=1e-5)
     assert all(p.grad is not None for p in policy.parameters())
+
+
+def test_whether_a_task_that_is_not_imported_is_symmetric_must_be_said(recording, tmp_path):
+    own = shutil.copytree(recording, tmp_path / "own")
+    path = own / "meta/dynmap.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"task": "my_tasks:Lift"}))
+    with pytest.raises(ValueError, match="--policy.symmetric"):
+        new_policy(own)
+    assert new_policy(own, symmetric=True).symmetric
 
 
 @pytest.mark.parametrize("recolor", [False, True])

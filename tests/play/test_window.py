@@ -36,6 +36,9 @@ def test_keys_and_mouse(window):
     window.handle()
     assert played.person.direction.tolist() == [0, 0, 0]
     middle = {"pos": (8 + 64, 8 + 20 + 64), "button": 1}
+    pygame.event.post(pygame.event.Event(pygame.MOUSEBUTTONDOWN, middle | {"button": 4}))  # the wheel
+    window.handle()
+    assert played.person.target is None
     pygame.event.post(pygame.event.Event(pygame.MOUSEBUTTONDOWN, middle))
     window.handle()
     assert played.person.target == (0.5, 0.5)

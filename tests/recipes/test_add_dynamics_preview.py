@@ -39,7 +39,7 @@ def test_only_a_page_is_written(dataset, tmp_path, monkeypatch):
     before = sorted(dataset.parent.rglob("*"))
     main(Config(dataset=str(dataset), source="tracks", preview=1))
     assert sorted(dataset.parent.rglob("*")) == before
-    folder = tmp_path / "runs/add_dynamics/source_preview"
+    folder = tmp_path / "runs/add_dynamics_preview/source"
     assert sorted(path.name for path in folder.iterdir()) == ["quality.json", "report.html", "tracks.png"]
     checks = json.loads((folder / "quality.json").read_text())["checks"].values()
     assert {check["episode"] for check in checks} == {0}

@@ -1,6 +1,7 @@
 """The add_dynamics recipe on recordings of the tasks, which stay recordings."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,9 @@ import pytest
 import torch
 from robot_dataset import read_column
 
-from dynmap_rl.data import add_dynamics
+from dynmap_rl.data import add_dynamics, record_dataset
 from dynmap_rl.data.demonstrations import find_meta, load_dataset, load_demonstrations, load_meta
+from dynmap_rl.paper.sources import source_columns
 from recipes.add_dynamics import Config, main
 
 
@@ -122,3 +124,24 @@ def test_tracks_are_cart_and_block_in_their_order_alone(recording, tmp_path):
 def test_the_picture_of_a_recording_is_a_metre_wide(recording, tmp_path):
     with pytest.raises(ValueError, match="--width must be 1"):
         add_dynamics(recording, tmp_path / "tracked", source="tracks", replace=True, width=2.0)
+
+
+def test_a_recording_of_a_task_that_is_not_imported_is_one_of_cart_and_block(recording, tmp_path):
+    """A dataset must not run code, and its dynamics have the units and names of the tasks all the same."""
+    own = shutil.copytree(recording, tmp_path / "own")
+    path = own / "meta/dynmap.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"task": "my_tasks:Lift"}))
+    for root, output in ((recording, "known"), (own, "unknown")):
+        add_dynamics(root, tmp_path / output, source="tracks", replace=True)
+    known, unknown = (read_column(tmp_path / name, "dynamics.position") for name in ("known", "unknown"))
+    assert np.array_equal(known, unknown)
+    assert "layout" not in json.loads((tmp_path / "unknown/meta/dynmap.json").read_text())
+    add_dynamics(own, tmp_path / "angle", columns=np.array([2]), angles=np.array([2]), replace=True)
+    assert find_meta(tmp_path / "angle") is None
+
+
+def test_the_sources_of_task_3_can_be_derived(tmp_path):
+    """Its block falls through more than a turn."""
+    root = record_dataset(tmp_path / "bin", "bin_dropping", episodes=1, eval_episodes=1, workers=1)
+    for source in ("central_0", "savgol_10"):
+        add_dynamics(root, replace=True, preview=2, **source_columns("bin_dropping", source))

@@ -97,7 +97,7 @@ def test_the_shipped_policy_does_as_well_as_its_results_say(tmp_path):
 
 
 def test_late_frames_bridged_or_stale(tmp_path, monkeypatch):
-    monkeypatch.setattr("dynmap_rl.reporting.media.film_policy", lambda *arguments: None)
+    monkeypatch.setattr("dynmap_rl.reporting.media.film_policy", lambda *arguments, **options: None)
     rows = {}
     for mode in ([], ["--stale"]):
         late = "--delay", "6", "--jitter", "2", "--lost", "0.1", *mode
@@ -113,6 +113,33 @@ def test_late_frames_bridged_or_stale(tmp_path, monkeypatch):
         rows[bool(mode)] = result["rows"]
     assert rows[False]["first_scene_seed"] == rows[True]["first_scene_seed"]
     assert rows[False]["position_error"] != rows[True]["position_error"]
+
+
+def test_numbers_are_written_before_the_film_and_another_file(tmp_path, monkeypatch):
+    """Neither a film that cannot be drawn nor a file that cannot be written costs the evaluation."""
+
+    def fail(*arguments, **options):
+        raise OSError("no film")
+
+    monkeypatch.chdir(tmp_path)
+    few = {"eval": Evaluation("validation", 1, 0), "compute": Compute(threads=1)}
+    with pytest.raises(IsADirectoryError):
+        main(Config(policy="balance_reaching", output=tmp_path, **few))
+    [result] = tmp_path.glob("runs/evaluate/*/eval.json")
+    assert read_json(result)["episodes"] == 1
+    result.unlink()
+    monkeypatch.setattr("dynmap_rl.reporting.media.film_policy", fail)
+    with pytest.raises(OSError, match="no film"):
+        main(Config(policy="balance_reaching", output=tmp_path / "here.json", **few))
+    assert read_json(tmp_path / "here.json") == read_json(result)
+
+
+def test_a_page_that_cannot_be_written_is_an_error_before_the_evaluation(tmp_path, monkeypatch):
+    (tmp_path / "runs").touch()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("dynmap_rl.evaluation.protocol.evaluate", None)
+    with pytest.raises(OSError):
+        main(Config(policy="balance_reaching"))
 
 
 @pytest.mark.parametrize(

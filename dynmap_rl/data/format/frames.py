@@ -31,9 +31,7 @@ def choose_camera(root: Path, info: dict, camera: str | None = None) -> str:
     Raises:
         ValueError: the dataset has no camera, or no camera of that name.
     """
-    cameras = [
-        n for n, f in info["features"].items() if f["dtype"] in ("image", "video") and not _is_depth(f)
-    ]
+    cameras = list_cameras(info)
     if not cameras:
         raise ValueError(
             f"{root} must have an image or video column with colours, got none; choose another dataset"
@@ -41,6 +39,11 @@ def choose_camera(root: Path, info: dict, camera: str | None = None) -> str:
     if camera not in (None, *cameras):
         raise ValueError(f"--camera must be one of {', '.join(cameras)}, got {camera!r}")
     return camera or cameras[0]
+
+
+def list_cameras(info: dict) -> list[str]:
+    """Return the columns of the cameras of a dataset; depth maps are no cameras."""
+    return [n for n, f in info["features"].items() if f["dtype"] in ("image", "video") and not _is_depth(f)]
 
 
 def _is_depth(feature: dict) -> bool:
@@ -81,6 +84,10 @@ def iterate_frames(
     columns = ["episode_index", "timestamp", *([] if video else [camera])]
     largest = math.prod(info["features"][camera]["shape"])
     for file in sorted((root / "data").glob("*/*.parquet")):
+        if only is not None and not set(only) & set(
+            read_file(file, columns[:1])["episode_index"].to_pylist()
+        ):
+            continue
         table = read_file(file, columns)
         for episode, span in spans(table["episode_index"].to_numpy()):
             if only is not None and episode not in only:

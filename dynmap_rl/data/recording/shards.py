@@ -51,7 +51,7 @@ class Shard:
 
 def parts_folder(root: str | Path) -> Path:
     """Return the folder of the shards that become the dataset ``root``."""
-    root = Path(root)
+    root = Path(root).absolute()
     return root.with_name(f"{root.name}.parts")
 
 

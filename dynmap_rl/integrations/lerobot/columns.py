@@ -66,5 +66,15 @@ def read_columns(root: str | Path) -> TensorDict:
 
 
 def is_symmetric(task: str | None) -> bool:
-    """Return whether mirrored and shifted demonstrations of a task are demonstrations; false for no task."""
-    return task is not None and get_task(task, from_file=True).symmetric
+    """Return whether mirrored and shifted demonstrations of a task are demonstrations; false for no task.
+
+    Raises:
+        ValueError: the task is not known, as a dataset must not run code.
+    """
+    try:
+        return task is not None and get_task(task, from_file=True).symmetric
+    except ValueError as error:
+        raise ValueError(
+            f"whether mirrored demonstrations of the dataset's task {task!r} are demonstrations is not known; give "
+            "--policy.symmetric true or false"
+        ) from error

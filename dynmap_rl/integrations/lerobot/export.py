@@ -37,7 +37,7 @@ def export_to_lerobot(run: str | Path, folder: str | Path, seed: int = 0) -> Pat
     Raises:
         ValueError: the run has no policy of that seed, or was trained on a robot dataset.
     """
-    folder, run = Path(folder), find_run(run)
+    folder, run = Path(folder).expanduser(), find_run(run)
     actor = load_actor(run, seed)
     world_model, policy = actor.world_model, actor.policy
     sizes = {"action": policy.action.size, "goal": policy.goal.size}
@@ -90,7 +90,7 @@ def import_from_lerobot(folder: str | Path, run: str | Path, seed: int = 0) -> P
     Raises:
         ValueError: the folder holds no policy ``dynmap``, or ``run`` holds another run.
     """
-    folder, run = Path(folder), Path(run)
+    folder, run = Path(folder).expanduser(), Path(run).expanduser()
     if not (folder / "config.json").exists():
         raise ValueError(f"{folder} holds no LeRobot policy (no config.json)")
     try:
