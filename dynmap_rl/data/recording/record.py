@@ -60,7 +60,7 @@ def record_dataset(
     from filelock import FileLock, Timeout
 
     check_launcher(launcher)
-    root = Path(root).expanduser()
+    root = Path(root).expanduser().absolute()
     settings = {"task": task, "kind": kind, "episodes": episodes, "eval_episodes": eval_episodes}
     settings |= {"expert": str(expert or task), "format": FORMAT}
     _check_settings(root, settings)
