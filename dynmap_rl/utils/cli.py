@@ -17,7 +17,6 @@ import sys
 import tempfile
 import typing
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 
 from .graphics import check_mujoco_gl
@@ -80,12 +79,9 @@ def parse_settings(config_class: type, arguments: Sequence[str]):
     import mergedeep
     import yaml
 
-    decoding = draccus.parsers.decoding
-    read = decoding.decode_from_init
+    read = draccus.parsers.decoding.decode_from_init
     # Shells leave --output=~/x as it is.
     draccus.decode.register(Path, lambda value, path: read(Path, value, path).expanduser())
-    draccus.decode.register(int, partial(_read_number, decoding.decode_int))
-    draccus.decode.register(float, partial(_read_number, partial(read, float)))
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--config_path", type=lambda text: Path(text).expanduser())
     file, arguments = parser.parse_known_args(arguments)
@@ -101,15 +97,6 @@ def parse_settings(config_class: type, arguments: Sequence[str]):
             options.parser.set_defaults(**flatten(settings))  # draccus would show those of the nested classes
             arguments = ["--help"]  # not the options before it, which draccus would refuse now
         return options.parse_args(arguments)
-
-
-def _read_number(read: Callable, value, path: Sequence[str]) -> float:
-    """Read a number; draccus would take ``true`` for 1."""
-    from draccus.utils import DecodingError
-
-    if isinstance(value, bool):
-        raise DecodingError(path, f"must be a number, got {str(value).lower()}")
-    return read(value, path)
 
 
 def _complete_help(parser: argparse.ArgumentParser, config_class: type) -> None:

@@ -63,13 +63,6 @@ def test_texts_are_taken_as_they_are_and_paths_but_for_the_home_folder(run, text
     assert run(f"--color={text}", f"--output={text}") == expected
 
 
-@pytest.mark.parametrize("option", ["--steps", "--second.rate"])
-def test_true_is_no_number(run, option, capsys):
-    with pytest.raises(SystemExit):
-        run(option, "true")
-    assert option[2:] in capsys.readouterr().err
-
-
 def test_null_clears_an_option(run, tmp_path):
     (tmp_path / "file.yaml").write_text("output: here\n")
     assert run("--config_path", str(tmp_path / "file.yaml"), "--output", "null") == Settings()
