@@ -71,8 +71,8 @@ def main(config: Config) -> None:
     if config.policy:
         refuse(config, Config(), ["expert", "checkpoint"], "--policy")
     else:
-        seen = "delay", "jitter", "lost", "delay_error", "stale"
-        refuse(config, Config(), ["seed", "trust_remote_code", *seen], "an expert")
+        of_frames = "delay", "jitter", "lost", "delay_error", "stale"
+        refuse(config, Config(), ["seed", "trust_remote_code", *of_frames], "an expert")
         refuse(config.compute, Compute(), ["device"], "an expert", "compute.")
     torch.set_num_threads(1)  # networks are small, and threads would wait for each other
     folder, text, result, draw = (judge_policy if config.policy else judge_expert)(config)
@@ -117,12 +117,8 @@ def judge_policy(config: Config) -> tuple:
     folder.mkdir(parents=True, exist_ok=True)  # errors come before the evaluation
     result = evaluate(actor, task, config.eval, delay, workers=config.compute.threads if own else 1)["test"]
     draw = partial(film_policy, actor, task, result["rows"], delay=delay, failures=config.failures)
-    return (
-        folder,
-        summary_text(result["summary"]),
-        {"task": task, "policy": config.policy, **result, **late},
-        draw,
-    )
+    result = {"task": task, "policy": config.policy, **result, **late}
+    return folder, summary_text(result["summary"]), result, draw
 
 
 def read_delay(config: Config):
@@ -166,9 +162,8 @@ def judge_expert(config: Config) -> tuple:
     """Return folder, text, result and film as for a policy; the result has ``rates``, ``intervals`` (%) and ``rows``."""
     from dynmap_rl.envs.scene import scene_seeds
     from dynmap_rl.envs.tasks import get_task
-    from dynmap_rl.evaluation.experts import judge_demonstrator, list_outcomes
+    from dynmap_rl.evaluation.experts import judge_demonstrator, list_outcomes, summarize_outcomes
     from dynmap_rl.evaluation.rollout import failures_first
-    from dynmap_rl.evaluation.statistics import wilson
     from dynmap_rl.experts.careless import CarelessController
     from dynmap_rl.experts.network import list_checkpoints, load_expert, play_to_end, task_of_expert
     from dynmap_rl.reporting.media import film, film_demonstrator
@@ -188,17 +183,11 @@ def judge_expert(config: Config) -> tuple:
             network, trained_on = load_expert(expert, checkpoint), task_of_expert(expert, task)
         outcomes = list_outcomes(task, play_to_end(network, task, seeds, states=trained_on))
         draw = partial(film, network, task, states=trained_on)
-    rates = {name: 100 * sum(values) / len(seeds) for name, values in outcomes.items()}
-    intervals = {name: wilson(sum(values), len(seeds)) for name, values in outcomes.items()}
-    lines = [
-        f"{name.replace('_', ' '):22} {rate:5.1f} % [{intervals[name][0]:.1f}, {intervals[name][1]:.1f}]"
-        for name, rate in rates.items()
-    ]
     folder = name_folder(config, task.name, *Path(expert).parts[-4:], checkpoint)
     draw = partial(draw, failures_first(seeds, outcomes["success"], alone=config.failures))
-    rows = {name: "".join("01"[bool(value)] for value in values) for name, values in outcomes.items()}
-    result = {"task": config.task or task.name, "expert": expert, "checkpoint": checkpoint}
-    return folder, "\n".join(lines), result | {"rates": rates, "intervals": intervals, "rows": rows}, draw
+    text, numbers = summarize_outcomes(outcomes)
+    result = {"task": config.task or task.name, "expert": expert, "checkpoint": checkpoint, **numbers}
+    return folder, text, result, draw
 
 
 if __name__ == "__main__":

@@ -118,9 +118,8 @@ def add_dynamics(
     check_method(method or ("central" if source == "state" else "savgol"), window, order)
     table = read_table(root, info, ["timestamp", *old])
     rows = dict(islice(spans(table["episode_index"].to_numpy()), preview))
-    time = read_column(root, info, table, "timestamp", np.float64).numpy()[
-        : max(own.stop for own in rows.values()), 0
-    ]
+    end = max(own.stop for own in rows.values())
+    time = read_column(root, info, table, "timestamp", np.float64).numpy()[:end, 0]
     planar = meta is not None and _is_planar(meta)
     parts, entries, view = [], None, None  # names, motions by episode, and method
     if "state" in source:
@@ -148,7 +147,7 @@ def add_dynamics(
         for name in old:
             quantity = name.removeprefix("dynamics.")
             with contextlib.suppress(ValueError):  # damaged columns may be replaced too
-                before = read_column(root, info, table, name, np.float64).numpy()[: len(time)]
+                before = read_column(root, info, table, name, np.float64).numpy()[:end]
                 if before.shape == values[quantity].shape:
                     differences[quantity] = np.abs(values[quantity] - before).mean(0)
         quality = judge_quality(derived)

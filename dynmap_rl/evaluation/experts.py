@@ -76,6 +76,25 @@ def judge_demonstrator(task: BaseTask, seeds: Iterable[int]) -> dict[str, list[b
     return outcomes
 
 
+def summarize_outcomes(outcomes: dict[str, list[bool]]) -> tuple[str, dict[str, dict]]:
+    """Return the rates of outcomes as text, and as a dict of JSON values.
+
+    Args:
+        outcomes: see :func:`list_outcomes`.
+
+    Returns:
+        The text, and by outcome ``rates`` (%), ``intervals`` (95 %, Wilson) and ``rows``, a digit for each scene.
+    """
+    rates = {name: 100 * sum(values) / len(values) for name, values in outcomes.items()}
+    intervals = {name: wilson(sum(values), len(values)) for name, values in outcomes.items()}
+    rows = {name: "".join("01"[bool(value)] for value in values) for name, values in outcomes.items()}
+    lines = [
+        f"{name.replace('_', ' '):22} {rate:5.1f} % [{intervals[name][0]:.1f}, {intervals[name][1]:.1f}]"
+        for name, rate in rates.items()
+    ]
+    return "\n".join(lines), {"rates": rates, "intervals": intervals, "rows": rows}
+
+
 def fresh_scenes(count: int) -> list[int]:
     """Return the seeds of ``count`` scenes that are neither trained on nor test scenes of the tables."""
     return scene_seeds("exploration", count, start=10_000_000)
