@@ -8,6 +8,7 @@ from tensordict import TensorDictBase
 from .settings import Augmentation
 
 METERS_PER_PIXEL = 1 / 64
+POSES = ("agent_pos", "state")
 
 
 def augment(
@@ -17,7 +18,7 @@ def augment(
 
     Each change is a symmetry of the scene: a reflection of x (and theta), a shift by whole pixels that repeats the
     border, a permutation of the colour channels. Pixels, dynamics, action and goal change together. ``agent_pos`` and
-    ``state`` hold poses that do not, and are left out.
+    ``state`` hold poses that do not, and are left out, as are all of these under ``next``.
 
     Args:
         windows: ``[B, T]`` with ``pixels`` and, to be mirrored or shifted, ``action`` ``[B, T, 3]``, ``goal`` ``[B, T, 2]``
@@ -34,7 +35,7 @@ def augment(
     settings = settings or Augmentation()
     max_shift, mirror, recolor = settings.max_shift, settings.mirror, settings.recolor
     batch = windows.shape[0]
-    windows = windows.exclude("agent_pos", "state")
+    windows = windows.exclude(*POSES, *(("next", key) for key in (*POSES, "pixels", "goal", "dynamics")))
     sizes = {key: windows[key].shape[-1] for key in ("action", "goal") if key in windows}
     if (mirror or max_shift) and sizes != {"action": 3, "goal": 2}:
         raise ValueError(

@@ -15,7 +15,7 @@ def as_replay_buffer(
     """Make a replay buffer of episodes, whose ``sample()`` returns random windows ``[batch, length]``.
 
     Each window lies in one episode; all episodes, and all places in an episode, are equally likely. The buffer holds the
-    episodes themselves, not a copy. Samples are copies, with two more entries: ``trajectory`` ``[batch, length]``, the
+    episodes themselves, not a copy, unless they are a slice in time. Samples are copies, with two more entries: ``trajectory`` ``[batch, length]``, the
     number of the episode, and ``index``. ``append_transform`` takes any transform of windows, such as
     :class:`dynmap_rl.envs.WorldModelTransform`.
 
@@ -29,12 +29,17 @@ def as_replay_buffer(
         generator: source of the random numbers; by default torch's own.
 
     Raises:
-        ValueError: the episodes are not ``[E, T]``, or are shorter than ``length``.
+        ValueError: the episodes are not ``[E, T]``, are shorter than ``length``, or end before their last step.
     """
     if episodes.ndim != 2:
         raise ValueError(f"episodes must be [E, T], got {list(episodes.shape)}")
     count, steps = episodes.shape
     check_length(length, steps)
+    if ("next", "done") in episodes.keys(True) and episodes["next", "done"][:, :-1].any():
+        raise ValueError(
+            'each row must be one episode, but ("next", "done") is true before its last step; use TorchRL\'s buffer with '
+            "SliceSampler"
+        )
     number = torch.arange(count, device=episodes.device)[:, None].expand(count, steps)
     flat = episodes.copy().set("trajectory", number).reshape(-1)
     sampler = _WindowSampler(slice_len=length, traj_key="trajectory", truncated_key=None, cache_values=True)

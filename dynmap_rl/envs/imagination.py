@@ -84,6 +84,9 @@ class ImaginationEnv(ModelBasedEnvBase):
             td[key] = start.get(key, zeros)
         return self._decode(td.set("latent", latent))
 
+    def _input_td_has_state(self, tensordict: TensorDictBase | None) -> bool:
+        return False  # before version 0.15, TorchRL takes any step of a rollout for a state to begin at
+
     def _make_specs(self) -> None:
         shape, device = self.batch_size, self.device
         observation, state = Composite(shape=shape, device=device), Composite(shape=shape, device=device)

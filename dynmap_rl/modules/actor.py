@@ -151,6 +151,10 @@ class Actor(TensorDictModuleBase):
 
     In ``env.rollout`` or a collector, append :meth:`make_tensordict_primer` and ``InitTracker`` to the environment.
 
+    Behind the actor, a module that changes the action, such as TorchRL's exploration noise, comes too late for the
+    memory. Put it between :meth:`act` and :meth:`predict`, or use :class:`dynmap_rl.envs.WorldModelTransform` and
+    :class:`LatentActor`.
+
     Args:
         world_model: encoder and transition.
         policy: feed-forward or recurrent.

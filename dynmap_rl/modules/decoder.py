@@ -42,7 +42,8 @@ class PlainDecoder(nn.Module):
     ) -> torch.Tensor:
         """Decode ``[..., Z]`` and ``[..., H]`` twice to frames ``[..., 3, S, S]``, about 0..1."""
         x = torch.cat([predicted_latent, hidden1, hidden2], -1)
-        return self.draw(x.flatten(0, -2)).unflatten(0, x.shape[:-1]) + 0.5
+        frames = self.draw(x.reshape(-1, x.shape[-1]))
+        return frames.reshape(*x.shape[:-1], *frames.shape[1:]) + 0.5
 
     def draw(self, x: torch.Tensor) -> torch.Tensor:
         """Map states ``[N, Z + 2 H]`` to ``[N, outputs, S, S]``."""
@@ -98,16 +99,18 @@ class SpriteDecoder(nn.Module):
     ) -> torch.Tensor:
         """Decode ``[..., Z]`` and ``[..., H]`` twice to frames ``[..., 3, S, S]``, about 0..1."""
         x = torch.cat([predicted_latent, hidden1, hidden2], -1)
-        frames = self.draw_canvas(x.flatten(0, -2)).transpose(1, 2)  # rows first, as the sprites are
-        color, opacity = self.draw_sprites(x.flatten(0, -2)).split((3, 1), 3)
+        states = x.reshape(-1, x.shape[-1])
+        frames = self.draw_canvas(states).transpose(1, 2)  # rows first, as the sprites are
+        color, opacity = self.draw_sprites(states).split((3, 1), 3)
         for sprite, clear in zip(color.unbind(1), (1 - opacity).unbind(1), strict=True):
             frames = torch.addcmul(sprite, frames, clear)
-        return frames.transpose(1, 2).unflatten(0, x.shape[:-1])
+        frames = frames.transpose(1, 2)
+        return frames.reshape(*x.shape[:-1], *frames.shape[1:])
 
     def draw_canvas(self, x: torch.Tensor) -> torch.Tensor:
         """Draw what is behind the sprites, ``[N, 3, S, S]``, from states ``[N, Z + 2 H]``."""
         masks = self.masks.draw(x).float().flatten(2).softmax(1)  # (N, M, S^2)
-        colors = self.colors(x).float().view(len(x), -1, 3) + 0.5
+        colors = self.colors(x).float().unflatten(1, (-1, 3)) + 0.5
         return (colors.mT @ masks).unflatten(2, (self.image_size, self.image_size))
 
     def draw_sprites(self, x: torch.Tensor) -> torch.Tensor:

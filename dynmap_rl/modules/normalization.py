@@ -31,7 +31,13 @@ class Normalizer(nn.Module):
         return self.center.numel()
 
     def normalize(self, x: torch.Tensor) -> torch.Tensor:
-        """Map ``[..., D]`` from SI units to [-1, 1], in the type of the weights."""
+        """Map ``[..., D]`` from SI units to [-1, 1], in the type of the weights.
+
+        Raises:
+            ValueError: the last axis has another size than D.
+        """
+        if x.shape[-1:] != self.center.shape:
+            raise ValueError(f"expected [..., {self.size}], got {list(x.shape)}")
         return (x.to(self.center.dtype) - self.center) / self.scale
 
     def denormalize(self, x: torch.Tensor) -> torch.Tensor:

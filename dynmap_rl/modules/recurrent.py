@@ -11,7 +11,7 @@ State = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 class TwoLSTM(nn.Module):
     """Two LSTM layers that return the hidden states of both layers at every step.
 
-    The state is ``(hidden1, cell1, hidden2, cell2)``, each ``[B, H]``; None stands for zeros.
+    The state is ``(hidden1, cell1, hidden2, cell2)``, each ``[B, H]``.
 
     Args:
         input_size: entries of the input.
@@ -32,7 +32,10 @@ class TwoLSTM(nn.Module):
     def forward(
         self, x: torch.Tensor, state: State | None = None
     ) -> tuple[torch.Tensor, torch.Tensor, State]:
-        """Map ``[B, T, input]`` to ``hidden1``, ``hidden2`` ``[B, T, H]`` after each step, and the last state."""
+        """Map ``[B, T, input]`` to ``hidden1``, ``hidden2`` ``[B, T, H]`` after each step, and the last state.
+
+        Without ``state``, the windows begin with zeros.
+        """
         state1 = state2 = None
         if state is not None:
             h1, c1, h2, c2 = (s[None].contiguous() for s in state)
@@ -45,7 +48,7 @@ class TwoLSTM(nn.Module):
         """Map one step's input ``[..., input]`` and the state, ``[..., H]`` each, to the next state."""
         flat = tuple(s.reshape(-1, self.hidden_size) for s in state)
         after = self(x.reshape(-1, 1, x.shape[-1]), flat)[2]
-        return tuple(s.reshape(*x.shape[:-1], -1) for s in after)
+        return tuple(s.reshape(*x.shape[:-1], self.hidden_size) for s in after)
 
     def initial_state(self, batch: int, device=None) -> State:
         """Return the state at the start of B episodes: four zero tensors ``[B, H]``."""

@@ -40,7 +40,12 @@ def imitation_loss(
             whose last action is not known has the weight 1. 0 is the paper's loss.
         total: function of the sum of the weights, by whose result the loss is divided.
         within: bool ``[B, 1, 1]``, windows that begin within an episode, whose last action is not known.
+
+    Raises:
+        ValueError: the two actions have different shapes.
     """
+    if predicted.shape != action.shape:
+        raise ValueError(f"actions must be {list(predicted.shape)} as the policy's, got {list(action.shape)}")
     error = ((predicted - action) / normalizer.scale).abs().mean(-1, keepdim=True)
     weight = torch.ones_like(error)
     if emphasis:
@@ -142,10 +147,10 @@ class ImitationLoss(LossModule):
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Return the loss."""
-        check_windows(tensordict)
+        masks = self._loss_mask_keys()
+        check_windows(tensordict, masks=masks)
         keys = self.tensor_keys
         states = (tensordict[key] for key in self.in_keys[:-1])
-        masks = self._loss_mask_keys()
         target, ignore = find_target(tensordict, keys.action, keys.expert_action, keys.disturbed, masks)
         loss = imitation_loss(
             self.policy(*states), target, self.policy.action, ignore, self.emphasis,

@@ -99,11 +99,11 @@ class JointLoss(LossModule):
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Return the losses."""
-        check_windows(tensordict, steps=1 if self.end_to_end else 2)
+        keys, masks = self.tensor_keys, self.world_model_loss._loss_mask_keys()
+        check_windows(tensordict, 1 if self.end_to_end else 2, masks)
         latent, states = self.world_model_loss.predict(tensordict)
         losses = {} if self.end_to_end else self.world_model_loss.compare(tensordict, latent, states)
-        predicted = self.policy(latent, *states[1:], tensordict[self.tensor_keys.goal])
-        keys, masks = self.tensor_keys, self.world_model_loss._loss_mask_keys()
+        predicted = self.policy(latent, *states[1:], tensordict[keys.goal])
         target, ignore = find_target(tensordict, keys.action, keys.expert_action, keys.disturbed, masks)
         # Divided by the same number in all processes, so that the mean of their losses is the loss of the whole batch.
         total = mean_over_ranks if self.world_model_loss.sums_over_ranks() else (lambda weight: weight)

@@ -104,7 +104,7 @@ class WorldModelLoss(LossModule):
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Return the losses."""
-        check_windows(tensordict, steps=2)
+        check_windows(tensordict, 2, self._loss_mask_keys())
         latent, states = self.predict(tensordict)
         read = latent
         # Of the windows of all processes, of which each has every N-th.
@@ -155,6 +155,10 @@ class WorldModelLoss(LossModule):
         for name, value in model.decode_dynamics(predicted, hidden1, hidden2).items():
             scale = model.dynamics_decoder.normalizers[name].scale
             truth = tensordict[unravel_key((keys.dynamics, name))][:, 1:]
+            if truth.shape != value.shape:
+                raise ValueError(
+                    f"{name} must be [B, T, {value.shape[-1]}], got {list(truth.shape)} after the first step"
+                )
             for mask in (known, *masks.values(True, True)):
                 if mask is not None:  # unknown entries may be NaN, whose gradient no mask stops
                     truth = torch.where(mask.reshape(*truth.shape[:2], -1), truth, value.detach())

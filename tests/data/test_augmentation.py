@@ -85,7 +85,7 @@ def test_options_leave_the_other_changes_as_they_are():
     plain = augment(episodes, torch.Generator().manual_seed(3), Augmentation(mirror=False))["goal"]
     assert torch.equal(plain[..., 1], every["goal"][..., 1]) and not torch.equal(plain, every["goal"])
     off = augment(episodes, torch.Generator(), Augmentation(max_shift=0, mirror=False, recolor=False))
-    assert (off == episodes.select(*off.keys())).all()
+    assert (off == episodes.select(*off.keys(True, True))).all()
 
 
 @pytest.mark.parametrize("size", [2, 3])
@@ -123,3 +123,11 @@ def test_windows_of_other_sizes_cannot_be_moved():
     with pytest.raises(ValueError, match=r"got \{'action': 3, 'goal': 3\}"):
         augment(episodes, torch.Generator())
     assert (augment(episodes, torch.Generator(), Augmentation.off())["goal"] == 0).all()
+
+
+def test_no_next_observation_contradicts_the_one_that_follows():
+    episodes = make_episodes()
+    out = augment(episodes, torch.Generator().manual_seed(0))
+    assert not {"pixels", "goal", "dynamics", "agent_pos", "state"} & set(out["next"].keys())
+    assert torch.equal(out["next", "reward"], episodes["next", "reward"])
+    assert "pixels" in episodes["next"].keys(), "the caller's windows are left as they are"

@@ -23,9 +23,9 @@ CONSTANTS = {
 
 @pytest.fixture
 def episodes() -> TensorDict:
-    """Five episodes of eight steps; every step has its own number, and the flags of its end are not all at the end."""
+    """Five episodes of eight steps; every step has its own number."""
     number = torch.arange(40).reshape(5, 8, 1)
-    done = number % 8 >= 5
+    done = number % 8 == 7
     return TensorDict({"number": number, "next": {"done": done}}, [5, 8])
 
 
@@ -37,7 +37,13 @@ def test_samples_are_windows_of_one_episode_each(episodes):
     assert (number.diff(dim=1) == 1).all()
     assert (number // 8 == sample["trajectory"]).all()
     assert set(number[:, 0].tolist()) == {8 * e + t for e in range(5) for t in range(6)}, "every place"
-    assert torch.equal(sample["next", "done"], number.unsqueeze(-1) % 8 >= 5), "flags are as they were"
+    assert torch.equal(sample["next", "done"], number.unsqueeze(-1) % 8 == 7)
+
+
+def test_rows_with_more_than_one_episode_are_refused(episodes):
+    episodes["next", "done"][2, 4] = True
+    with pytest.raises(ValueError, match="one episode"):
+        as_replay_buffer(episodes, batch=2, length=3)
 
 
 def test_sampling_again_and_whole_episodes(episodes):

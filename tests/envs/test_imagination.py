@@ -115,6 +115,19 @@ def test_resets_go_to_the_start_or_where_they_are_told(frames):
     assert torch.equal(env.reset()["hidden2"], start["hidden2"])
 
 
+@torch.no_grad()
+def test_worlds_of_a_rollout_are_reset_one_by_one(frames):
+    env = TransformedEnv(ImaginationEnv(make_model(), make_start(make_model(), frames)), InitTracker())
+    first = env.reset()
+    last = env.rollout(3)[:, -1]["next"]
+    mask = torch.zeros(*env.batch_size, 1, dtype=torch.bool)
+    mask[0] = True
+    td = env.reset(last.clone().set("_reset", mask))
+    for key in ("latent", "hidden1"):
+        assert torch.equal(td[key][0], first[key][0]) and torch.equal(td[key][1:], last[key][1:])
+    assert torch.equal(td["is_init"], mask)
+
+
 @pytest.mark.parametrize("kind", ["feedforward", "recurrent"])
 def test_policies_act_in_it(frames, kind):
     model = make_model()

@@ -11,3 +11,8 @@ def test_normalizer_maps_the_range_to_plus_minus_one_and_back():
     torch.testing.assert_close(normalizer.denormalize(normalizer.normalize(x)), x)
     with pytest.raises(ValueError, match=r"\[0.0\] and \[0.0\]"):
         Normalizer([0.0], [0.0])
+
+
+def test_another_number_of_entries_is_refused():
+    with pytest.raises(ValueError, match=r"\[..., 2\], got \[5, 1\]"):
+        Normalizer([0.0, -2.0], [1.0, 4.0]).normalize(torch.zeros(5, 1))

@@ -145,3 +145,18 @@ def test_memories_stay_in_training_mode():
     model = make_model().eval()
     assert not model.training and not model.encoder.training
     assert all(part.training for part in model.modules() if isinstance(part, torch.nn.LSTM))
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("batch", [(), (0,), (2, 0), (2, 3)])
+def test_steps_and_decoders_take_any_batch(batch):
+    model = make()
+    frames = torch.zeros(*batch, 3, 64, 64, dtype=torch.uint8)
+    latent = model.encode(frames)
+    memory = tuple(torch.zeros(*batch, model.hidden_size) for _ in range(4))
+    predicted, memory = model.step(latent, torch.zeros(*batch, 3), memory)
+    assert predicted.shape == (*batch, model.latent_size)
+    assert all(x.shape == (*batch, model.hidden_size) for x in memory)
+    states = predicted, memory[0], memory[2]
+    assert model.decode_pixels(*states).shape == (*batch, 3, 64, 64)
+    assert model.decode_dynamics(*states)["position"].shape == (*batch, 6)

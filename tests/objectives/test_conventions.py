@@ -159,6 +159,29 @@ def test_other_input_than_windows_of_one_episode_is_refused(name, td):
         loss(td)
 
 
+@every_loss
+def test_a_window_may_go_on_after_an_end_only_with_masked_steps(name, td):
+    loss, ends = make(name), torch.zeros(B, T, 1, dtype=torch.bool)
+    ends[:, -1] = ends[1, 3] = True
+    td["next"] = {"done": ends}
+    with pytest.raises(ValueError, match="one episode"):
+        loss(td)
+    td["collector", "mask"] = torch.ones(B, T, dtype=torch.bool)
+    td["collector", "mask"][1, 4:] = False
+    loss(td)
+
+
+@every_loss
+@pytest.mark.parametrize("key", ["action", "goal", ("dynamics", "position")])
+def test_another_number_of_entries_is_refused(name, key, td):
+    loss = make(name)
+    if key not in loss.in_keys:
+        pytest.skip(f"{name} does not read {key}")
+    td = td.exclude("expert_action").set(key, td[key][..., :1])
+    with pytest.raises(ValueError, match="1]"):
+        loss(td)
+
+
 def test_losses_name_what_they_need():
     with pytest.raises(TypeError, match="WorldModel"):
         WorldModelLoss(torch.nn.Linear(2, 2))
