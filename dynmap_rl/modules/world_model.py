@@ -29,6 +29,8 @@ ARCHITECTURES = {
 class WorldModel(nn.Module):
     """Encoder, transition and decoders.
 
+    Weights and memories are float32; for speed, frames can be encoded under ``torch.autocast`` (see :meth:`encode`).
+
     Args:
         action: normaliser of the actions.
         dynamics: normaliser of each supervised quantity: any of position, velocity, acceleration, or none.
