@@ -18,7 +18,7 @@ def augment(
 
     Each change is a symmetry of the scene: a reflection of x (and theta), a shift by whole pixels that repeats the
     border, a permutation of the colour channels. Pixels, dynamics, action and goal change together. ``agent_pos`` and
-    ``state`` hold poses that do not, and are left out, as are all of these under ``next``.
+    ``state`` hold poses that do not. They are left out, and so are all next observations and dynamics.
 
     Args:
         windows: ``[B, T]`` with ``pixels`` and, to be mirrored or shifted, ``action`` ``[B, T, 3]``, ``goal`` ``[B, T, 2]``

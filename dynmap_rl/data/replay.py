@@ -15,9 +15,9 @@ def as_replay_buffer(
     """Make a replay buffer of episodes, whose ``sample()`` returns random windows ``[batch, length]``.
 
     Each window lies in one episode; all episodes, and all places in an episode, are equally likely. The buffer holds the
-    episodes themselves, not a copy, unless they are a slice in time. Samples are copies, with two more entries: ``trajectory`` ``[batch, length]``, the
-    number of the episode, and ``index``. ``append_transform`` takes any transform of windows, such as
-    :class:`dynmap_rl.envs.WorldModelTransform`.
+    episodes themselves, not a copy, unless they are a slice in time. Samples are copies, with two more entries:
+    ``trajectory`` ``[batch, length]``, the number of the episode, and ``index``. ``append_transform`` takes any transform
+    of windows, such as :class:`dynmap_rl.envs.WorldModelTransform`.
 
     Losses on single transitions need next observations, which the episodes do not repeat. For these use TorchRL's own
     buffer with ``SliceSampler`` and ``NextStateReconstructor`` (see ``dynmap_rl/data/README.md``).

@@ -154,11 +154,10 @@ class WorldModelLoss(LossModule):
         losses["loss_latent"] = self.beta_z * self._mean(self._latent_error(latent, predicted, read), masks)
         for name, value in model.decode_dynamics(predicted, hidden1, hidden2).items():
             scale = model.dynamics_decoder.normalizers[name].scale
-            truth = tensordict[unravel_key((keys.dynamics, name))][:, 1:]
-            if truth.shape != value.shape:
-                raise ValueError(
-                    f"{name} must be [B, T, {value.shape[-1]}], got {list(truth.shape)} after the first step"
-                )
+            truth = tensordict[unravel_key((keys.dynamics, name))]
+            if truth.shape[-1] != value.shape[-1]:
+                raise ValueError(f"{name} must be [B, T, {value.shape[-1]}], got {list(truth.shape)}")
+            truth = truth[:, 1:]
             for mask in (known, *masks.values(True, True)):
                 if mask is not None:  # unknown entries may be NaN, whose gradient no mask stops
                     truth = torch.where(mask.reshape(*truth.shape[:2], -1), truth, value.detach())

@@ -8,9 +8,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from datasets.features.features import Array2DExtensionType
 
 from dynmap_rl.data.format.frames import choose_camera, iterate_frames
-from dynmap_rl.data.format.reading import choose_splits, find_dataset, read_table
+from dynmap_rl.data.format.reading import choose_splits, find_dataset, read_column, read_table
 from dynmap_rl.utils.files import write_json
 
 
@@ -43,6 +44,24 @@ def test_an_index_that_does_not_number_the_frames_is_refused(tmp_path, index):
     pq.write_table(table, tmp_path / "data/chunk-000/file-000.parquet")
     with pytest.raises(ValueError, match="number all frames"):
         read_table(tmp_path, {"total_frames": 4, "features": {}}, [])
+
+
+def test_an_episode_in_two_blocks_is_refused(tmp_path):
+    (tmp_path / "data/chunk-000").mkdir(parents=True)
+    table = pa.table({"index": range(4), "episode_index": [0, 1, 0, 1]})
+    pq.write_table(table, tmp_path / "data/chunk-000/file-000.parquet")
+    with pytest.raises(ValueError, match="one block"):
+        read_table(tmp_path, {"total_frames": 4, "features": {}}, [])
+
+
+def test_a_matrix_in_each_row_is_read_with_and_without_the_type_of_datasets():
+    values = np.arange(12, dtype=np.float32).reshape(2, 2, 3)
+    info = {"features": {"action": {"shape": [2, 3]}}}
+    matrix = Array2DExtensionType((2, 3), "float32")
+    typed = pa.ExtensionArray.from_storage(matrix, pa.array(values.tolist(), matrix.storage_type))
+    for column in (typed, typed.storage):
+        read = read_column(Path(), info, pa.table({"action": column}), "action")
+        assert read.tolist() == values.reshape(2, 6).tolist()
 
 
 def test_frames_of_two_sizes_are_refused(tmp_path):

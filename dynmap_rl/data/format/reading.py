@@ -208,7 +208,8 @@ def read_table(root: Path, info: dict, columns: list[str], by_time: bool = True)
         by_time: sort by ``index``; otherwise the order is that of the files.
 
     Raises:
-        ValueError: a file is damaged, columns or frames are missing, or ``index`` does not number the frames.
+        ValueError: a file is damaged, columns or frames are missing, ``index`` does not number the frames, or the rows of an
+            episode are apart.
     """
     tables = list(iterate_tables(root, columns))
     try:
@@ -229,6 +230,9 @@ def read_table(root: Path, info: dict, columns: list[str], by_time: bool = True)
             f"the column index of {root} must number all frames from 0, got {table['index'][int(wrong.argmax())]} for frame "
             f"{wrong.argmax()}; number them anew, in the order of episodes and time"
         )
+    numbers = [episode for episode, _ in spans(table["episode_index"].to_numpy())]
+    if len(numbers) > len(set(numbers)):
+        raise ValueError(f"an episode of {root} must be one block of rows; number the episodes anew")
     return table
 
 
@@ -252,6 +256,8 @@ def read_column(
         ValueError: numbers are missing or not finite, or a row has not as many as ``meta/info.json`` says.
     """
     flat = table[name].combine_chunks()
+    if isinstance(flat, pa.ExtensionArray):  # a matrix in each row, where the package datasets is imported
+        flat = flat.storage
     while pa.types.is_list(flat.type) or pa.types.is_fixed_size_list(flat.type):
         flat = flat.flatten()
     values = flat.to_numpy(zero_copy_only=False)
