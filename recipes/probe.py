@@ -48,6 +48,7 @@ class Config:
 def main(config: Config) -> None:
     """Measure, draw and report."""
     from dynmap_rl.data.demonstrations import load_dataset, load_meta
+    from dynmap_rl.envs.task import BODIES
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.evaluation.open_loop import decodes_poses, open_loop_errors
     from dynmap_rl.evaluation.perception import begin_scenes, color_errors, locate_cart
@@ -67,6 +68,11 @@ def main(config: Config) -> None:
     dataset = find_or_record(task, config.dataset)
     train = load_dataset(dataset, "train", config.cache)[: config.train_episodes]
     test = load_dataset(dataset, "eval", config.cache)[: config.test_episodes]
+    if (entries := test["dynamics", "position"].shape[-1]) != len(BODIES):
+        raise ValueError(
+            f"--dataset must have the poses of cart and block, {len(BODIES)} entries, got {entries}; use the recording that "
+            "it is derived from"
+        )
     if "labelled" in test.keys() and not test["labelled"].all():
         raise ValueError(
             "--dataset must have the dynamics of every frame, got tracks with gaps; use the recording that they are of"

@@ -109,10 +109,27 @@ def read_state(root: Path, info: dict, state: StateSource) -> Iterator[tuple[int
 
 
 def entry_names(info: dict, column: str) -> list[str]:
-    """Return a name for every entry of a column: the dataset's own names, or numbers where it has none."""
+    """Return a name for every entry of a column, all different.
+
+    These are the dataset's own names: a list, a list for each group, as in ``{"motors": [...]}``, or the entry of each
+    name, as in ``{"gripper": 6}``. Equal names are preceded by their group, or followed by their entry. A column without
+    names has numbers.
+    """
     feature = info["features"][column]
     size, names = math.prod(feature["shape"]), feature.get("names")
-    if isinstance(names, dict):  # by groups, as in {"motors": [...]}
-        names = [name for group in names.values() if isinstance(group, list) for name in group]
-    named = isinstance(names, list) and len(names) == size
-    return [str(name) for name in names] if named else [str(i) for i in range(size)]
+    if isinstance(names, dict):
+        names = _ungroup(names, size)
+    if not isinstance(names, list) or len(names) != size:
+        return [str(i) for i in range(size)]
+    names = [str(name) for name in names]
+    names = [f"{name}_{i}" if names.count(name) > 1 else name for i, name in enumerate(names)]
+    return names if len(set(names)) == size else [str(i) for i in range(size)]
+
+
+def _ungroup(names: dict, size: int) -> list:
+    """Return the names of groups, or of numbered entries, in order of the entries."""
+    if sorted(map(str, names.values())) == sorted(map(str, range(size))):
+        return sorted(names, key=names.get)
+    grouped = [(group, str(name)) for group, own in names.items() if isinstance(own, list) for name in own]
+    plain = [name for _, name in grouped]
+    return [f"{group}_{name}" if plain.count(name) > 1 else name for group, name in grouped]

@@ -64,19 +64,21 @@ def track_centroid(frames: np.ndarray, threshold: int = 30) -> tuple[np.ndarray,
         ``[T, 2]``, x (right) and y (down) in pixels, float64, and whether something was found, bool ``[T]``.
 
     Raises:
-        ValueError: nothing moves. The message is the end of a sentence.
+        ValueError: nothing moves, or specks only. The message is the end of a sentence.
     """
-    background = _background(frames, threshold)
+    background, specks = _background(frames, threshold), False
     centroids = np.full((len(frames), 2), np.nan)
     for t, frame in enumerate(frames):
         difference = _changed(frame, background, threshold)
+        specks = specks or difference.any()
         mask = cv2.morphologyEx((difference > 0).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
         moments = cv2.moments(difference * mask)
         if moments["m00"]:
             centroids[t] = moments["m10"] / moments["m00"], moments["m01"] / moments["m00"]
     found = ~np.isnan(centroids[:, 0])
     if not found.any():
-        raise ValueError(_still(threshold))
+        small = "nothing larger than a speck moves: no 3 x 3 pixels differ; film from nearer, or use --source tracks"
+        raise ValueError(small if specks else _still(threshold))
     return fill_gaps(centroids, found), found
 
 

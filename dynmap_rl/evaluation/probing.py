@@ -59,19 +59,22 @@ def judge_states(probed: dict[str, dict]) -> dict:
 
     Returns:
         ``verdict`` (``good`` from an R^2 of 0.75 on, or ``doubtful``), the best ``state``, and its mean ``r2`` over the
-        entries that move.
+        entries that move; ``r2`` is None if none does.
     """
     means = {
         state: torch.tensor(found["velocity"]).nanmean().nan_to_num(-torch.inf).item()
         for state, found in probed.items()
     }
     state = max(means, key=means.get)
-    return {"verdict": "good" if means[state] >= GOOD else "doubtful", "state": state, "r2": means[state]}
+    r2 = means[state] if means[state] > -torch.inf else None  # JSON has no infinity
+    return {"verdict": "good" if means[state] >= GOOD else "doubtful", "state": state, "r2": r2}
 
 
 def judged_text(judged: dict) -> str:
     """Return the result of :func:`judge_states` as text."""
     verdict, state, r2 = (judged[key] for key in ("verdict", "state", "r2"))
+    if r2 is None:
+        return f"{verdict}; nothing moves in the held-out episodes"
     return f"{verdict}; a linear map of {state} explains {r2:.2f} of the velocities"
 
 

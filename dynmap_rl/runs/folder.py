@@ -78,7 +78,8 @@ def compare_settings(stored: dict, config) -> dict[str, tuple]:
     """
     new = flatten(plain_settings(config))
     old = flatten(plain_settings(type(config)())) | flatten(stored)
-    return {k: (old.get(k), new.get(k)) for k in sorted({*old, *new}) if old.get(k) != new.get(k)}
+    pairs = {k: (old.get(k), new.get(k)) for k in sorted({*old, *new})}
+    return {k: pair for k, pair in pairs.items() if _bare(pair[0]) != _bare(pair[1])}
 
 
 def plain_settings(config) -> dict:
@@ -155,6 +156,11 @@ def load_training_state(path: Path) -> dict | None:
     if gpu is not None and torch.cuda.is_initialized():
         torch.cuda.set_rng_state(gpu)
     return state
+
+
+def _bare(value):
+    """Return a path, or any other value, without the slash at the end."""
+    return value.rstrip("/") if isinstance(value, str) else value
 
 
 def _to_number(value):

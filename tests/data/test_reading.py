@@ -10,8 +10,9 @@ import pyarrow.parquet as pq
 import pytest
 from datasets.features.features import Array2DExtensionType
 
-from dynmap_rl.data.format.frames import choose_camera, iterate_frames
+from dynmap_rl.data.format.frames import choose_camera, iterate_frames, join_views
 from dynmap_rl.data.format.reading import choose_splits, find_dataset, read_column, read_table
+from dynmap_rl.data.state import entry_names
 from dynmap_rl.utils.files import write_json
 
 
@@ -64,11 +65,32 @@ def test_a_matrix_in_each_row_is_read_with_and_without_the_type_of_datasets():
         assert read.tolist() == values.reshape(2, 6).tolist()
 
 
+def test_frames_are_in_order_of_time_too(tmp_path):
+    (tmp_path / "data/chunk-000").mkdir(parents=True)
+    images = [
+        cv2.imencode(".png", np.full((8, 8, 3), value, np.uint8))[1].tobytes() for value in (30, 20, 10)
+    ]
+    frames = [{"bytes": image, "path": None} for image in images]
+    rows = {"index": [2, 1, 0], "episode_index": [1, 0, 0], "timestamp": [0.0, 0.1, 0.0], "top": frames}
+    pq.write_table(pa.table(rows), tmp_path / "data/chunk-000/file-000.parquet")
+    info = {"features": {"top": {"dtype": "image", "shape": [8, 8, 3]}}}
+    read = {
+        episode: frames[:, 0, 0, 0].tolist() for episode, frames, _ in iterate_frames(tmp_path, info, "top")
+    }
+    assert read == {0: [10, 20], 1: [30]}
+
+
+def test_a_side_is_averaged_where_it_is_reduced_though_the_other_is_enlarged():
+    view = np.zeros((16, 128, 3), np.uint8)
+    view[:, ::4] = 200  # stripes of a pixel, which interpolation between two neighbours misses
+    assert (join_views([view], 32) == 50).all()
+
+
 def test_frames_of_two_sizes_are_refused(tmp_path):
     (tmp_path / "data/chunk-000").mkdir(parents=True)
     images = [cv2.imencode(".png", np.zeros((side, 8, 3), np.uint8))[1].tobytes() for side in (8, 6)]
     frames = [{"bytes": image, "path": None} for image in images]
-    table = pa.table({"episode_index": [0, 0], "timestamp": [0.0, 0.1], "top": frames})
+    table = pa.table({"index": [0, 1], "episode_index": [0, 0], "timestamp": [0.0, 0.1], "top": frames})
     pq.write_table(table, tmp_path / "data/chunk-000/file-000.parquet")
     info = {"features": {"top": {"dtype": "image", "shape": [8, 8, 3]}}}
     with pytest.raises(ValueError, match="episode 0 must have one size"):
@@ -81,6 +103,21 @@ def test_an_id_is_looked_for_where_lerobot_records(tmp_path, monkeypatch):
         find_dataset("me/mine")
     write_json(tmp_path / "me/mine/meta/info.json", {})
     assert find_dataset("me/mine") == tmp_path / "me/mine"
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (["a", "b", "a"], ["a_0", "b", "a_2"]),
+        ({"left": ["j0", "grip"], "right": ["j0"]}, ["left_j0", "grip", "right_j0"]),
+        ({"delta_y": 1, "delta_x": 0, "gripper": 2}, ["delta_x", "delta_y", "gripper"]),
+        ({"motors": ["a", "b"]}, ["0", "1", "2"]),
+        (["a_1", "a", "a"], ["0", "1", "2"]),
+        (None, ["0", "1", "2"]),
+    ],
+)
+def test_every_entry_of_a_column_has_a_name_of_its_own(names, expected):
+    assert entry_names({"features": {"action": {"shape": [3], "names": names}}}, "action") == expected
 
 
 def test_a_depth_map_is_no_camera():

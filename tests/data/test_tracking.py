@@ -34,6 +34,14 @@ def test_specks_are_left_out_of_a_centroid():
     np.testing.assert_allclose(track_centroid(specked)[0], track_centroid(frames)[0], atol=0.1)
 
 
+def test_a_thing_smaller_than_a_speck_is_said_to_be_small():
+    frames = np.full((40, 32, 96, 3), 200, np.uint8)
+    for t, frame in enumerate(frames):
+        frame[12:14, 2 * t : 2 * t + 2] = 0
+    with pytest.raises(ValueError, match="speck"):
+        track_centroid(frames)
+
+
 def test_pixels_of_a_centroid_weigh_by_their_difference():
     frames = np.full((41, 32, 96, 3), 200, np.uint8)
     for t, frame in enumerate(frames):  # a dark square and, right of it, its light shadow

@@ -39,6 +39,12 @@ def test_r2_of_linear_independent_and_constant_states(monkeypatch):
     assert min(found["latent"]["position"]) > 0.999, "what is not known is no truth"
 
 
+def test_nothing_is_explained_where_nothing_moves():
+    found = probing.judge_states({"latent": {"velocity": [math.nan]}, "hidden1": {"velocity": [math.nan]}})
+    assert found["verdict"] == "doubtful" and found["r2"] is None
+    assert "nothing moves" in probing.judged_text(found)
+
+
 def test_the_best_state_decides():
     def explain(*values):
         return {"velocity": list(values), "position": [1.0, 1.0]}

@@ -104,6 +104,12 @@ def test_a_dataset_of_another_task_is_refused(trained, recordings, tmp_path):
     assert result.returncode == 2 and "must be a dataset of balance_reaching" in result.stderr
 
 
+def test_positions_of_other_things_are_no_truth(trained, recording, tmp_path):
+    add_dynamics(recording, tmp_path / "centroid", source="centroid", replace=True)
+    result = run(tmp_path, "probe", "--runs", trained / "none", "--dataset", "centroid")
+    assert result.returncode == 2 and "6 entries, got 2" in result.stderr
+
+
 def test_tracks_with_gaps_are_no_truth(trained, recording, tmp_path):
     add_dynamics(recording, tmp_path / "tracks", source="tracks", replace=True)
     for path in (tmp_path / "tracks/data").rglob("*.parquet"):

@@ -44,6 +44,10 @@ def test_a_run_reopens_with_the_same_settings_only(tmp_path):
     more = replace(settings, world_model=Group(updates=6))
     for name in ("world_model.updates", "world_model"):
         open_run(tmp_path / "run", more, ignore=(name,))
+    named = replace(settings, run=f"{settings.run}/", names=("a", "b"))
+    open_run(
+        tmp_path / "run", replace(named, world_model=Group(updates=5))
+    )  # a slash at the end says nothing
     assert read_json(tmp_path / "run/config.json")["world_model"] == {"updates": 5, "rate": 0.1}
 
 

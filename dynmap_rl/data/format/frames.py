@@ -60,7 +60,7 @@ def iterate_frames(
     widest: int | None = None,
     only: Collection[int] | None = None,
 ) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-    """Iterate over the episodes' frames.
+    """Iterate over the episodes' frames, in order of time.
 
     Frames are reduced with ``cv2.INTER_AREA``, which averages, and enlarged with ``cv2.INTER_LINEAR``.
 
@@ -81,7 +81,7 @@ def iterate_frames(
     """
     video = info["features"][camera]["dtype"] == "video"
     episodes = _read_episodes(root, camera) if video else {}
-    columns = ["episode_index", "timestamp", *([] if video else [camera])]
+    columns = ["episode_index", "index", "timestamp", *([] if video else [camera])]
     largest = math.prod(info["features"][camera]["shape"])
     for file in sorted((root / "data").glob("*/*.parquet")):
         if only is not None and not set(only) & set(
@@ -89,6 +89,8 @@ def iterate_frames(
         ):
             continue
         table = read_file(file, columns)
+        if (np.diff(index := table["index"].to_numpy()) < 0).any():  # the order of time, as in read_table
+            table = table.take(np.argsort(index))
         for episode, span in spans(table["episode_index"].to_numpy()):
             if only is not None and episode not in only:
                 continue
@@ -188,5 +190,5 @@ def _resize(frame: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     height, width = frame.shape[:2]
     if size == (width, height):
         return frame
-    smaller = size[0] <= width and size[1] <= height
-    return cv2.resize(frame, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
+    reduced = cv2.resize(frame, (min(size[0], width), min(size[1], height)), interpolation=cv2.INTER_AREA)
+    return cv2.resize(reduced, size, interpolation=cv2.INTER_LINEAR)
