@@ -92,8 +92,10 @@ def fit(
     form = plain_settings(one) | {"seed": seed}
     if state := load_training_state(path):
         stored = dict(state.get("form", form))
-        other = stored.pop("seed") != form["seed"] or compare_settings(stored, one)
-        if other or state["update"] > settings.updates:
+        other = stored["seed"] != seed
+        if not hasattr(one, "seed"):
+            del stored["seed"]
+        if other or compare_settings(stored, one) or state["update"] > settings.updates:
             raise ValueError(f"{folder} holds a training with other settings; choose another folder")
         model.load_state_dict(state["model"])
         optimizer.load_state_dict(state["optimizer"])

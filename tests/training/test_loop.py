@@ -17,9 +17,10 @@ from dynmap_rl.training.world_model import train_world_model
 from dynmap_rl.utils.weights import fingerprint
 
 
-def test_a_resumed_training_equals_an_uninterrupted_one(tmp_path, monkeypatch):
-    episodes, whole = make_episodes(), make_model()
-    train_world_model(whole, episodes, tmp_path / "whole", WORLD_MODEL, save_every=2)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_resumed_training_equals_an_uninterrupted_one(tmp_path, monkeypatch, seed):
+    episodes, whole, settings = make_episodes(), make_model(), replace(WORLD_MODEL, seed=seed)
+    train_world_model(whole, episodes, tmp_path / "whole", settings, save_every=2)
 
     save, step, updates = loop.save_training_state, loop.step, []
 
@@ -30,11 +31,11 @@ def test_a_resumed_training_equals_an_uninterrupted_one(tmp_path, monkeypatch):
 
     with monkeypatch.context() as patch, pytest.raises(Stop):
         patch.setattr(loop, "save_training_state", save_then_stop)
-        train_world_model(make_model(), episodes, tmp_path / "parts", WORLD_MODEL, save_every=2)
+        train_world_model(make_model(), episodes, tmp_path / "parts", settings, save_every=2)
     append_metrics(tmp_path / "parts", 5, loss_rgb=0.0)  # written after the last state, then killed
     resumed = make_model()
     monkeypatch.setattr(loop, "step", lambda *args: updates.append(1) or step(*args))
-    train_world_model(resumed, episodes, tmp_path / "parts", WORLD_MODEL, save_every=2)
+    train_world_model(resumed, episodes, tmp_path / "parts", settings, save_every=2)
 
     assert len(updates) == 2, "saved updates are not repeated"
     assert fingerprint(resumed) == fingerprint(whole)
@@ -44,7 +45,7 @@ def test_a_resumed_training_equals_an_uninterrupted_one(tmp_path, monkeypatch):
 def test_a_folder_with_a_training_of_other_settings_is_refused(tmp_path):
     """Otherwise its weights would be taken for those of the new settings."""
     train_world_model(make_model(), make_episodes(), tmp_path, WORLD_MODEL)
-    for change in ({"beta_z": 0.9}, {"updates": 1}):
+    for change in ({"beta_z": 0.9}, {"updates": 1}, {"seed": 1}):
         with pytest.raises(ValueError, match="other settings"):
             train_world_model(make_model(), make_episodes(), tmp_path, replace(WORLD_MODEL, **change))
 
