@@ -88,8 +88,9 @@ def main(config: Config) -> None:
 
 
 def name_folder(config: Config, *names: str) -> Path:
-    """Return the folder of an evaluation."""
-    return Path("runs/evaluate") / "_".join([*names, config.eval.split]).replace("/", "")[-255:]
+    """Return the folder of an evaluation, another one for each number of episodes."""
+    few = [] if (n := config.eval.episodes) == Evaluation.episodes else [f"{n}_episodes"]
+    return Path("runs/evaluate") / "_".join([*names, config.eval.split, *few]).replace("/", "")[-255:]
 
 
 def judge_policy(config: Config) -> tuple:

@@ -152,6 +152,8 @@ def load_world_models(runs: list[str]) -> tuple[dict, str]:
 
 def describe(open_loop: dict, probes: dict, perception: dict, verdicts: dict, seconds: float) -> str:
     """Return the results as lines of text."""
+    import numpy as np
+
     from dynmap_rl.evaluation.probing import judged_text
 
     lines = []
@@ -169,7 +171,7 @@ def describe(open_loop: dict, probes: dict, perception: dict, verdicts: dict, se
             )
     for name, states in probes.items():
         for state, quantities in states.items():
-            values = "  ".join(f"{q} {sum(r2) / len(r2):5.2f}" for q, r2 in quantities.items())
+            values = "  ".join(f"{q} {np.nanmean(r2):5.2f}" for q, r2 in quantities.items())
             lines.append(f"{name}: R^2 of {state:8} {values}")
     for name, found in verdicts.items():
         lines.append(f"{name}: {judged_text(found)}")

@@ -233,7 +233,7 @@ def plot_probes(probes: dict[str, dict], path: Path) -> None:
         "R$^2$ of linear maps from the states to the dynamics (held-out demonstrations)", fontsize=11
     )
     for axis, state in zip(axes, STATES, strict=True):
-        values = np.array([[np.mean(p[state][q]) for q in DYNAMICS] for p in probes.values()])
+        values = np.array([[np.nanmean(p[state][q]) for q in DYNAMICS] for p in probes.values()])
         axis.imshow(values, vmin=0, vmax=1, cmap="Greens", aspect="auto")
         axis.set_title(state, fontsize=10)
         axis.set_xticks(range(len(DYNAMICS)), DYNAMICS, fontsize=9)

@@ -86,6 +86,8 @@ def film_policy(
 ) -> None:
     """Write eight evaluated episodes as an animation, failures first.
 
+    They are rolled out again. A policy that samples its actions, such as Diffusion Policy, may act otherwise this time.
+
     Args:
         actor: the actor that was evaluated.
         task: name of the task.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -113,7 +114,7 @@ def robot_row_text(result: dict) -> str:
     for quantity, constant in result["spread"].items():
         simple = [constant, *([result["change"][quantity]] if "change" in result else [])]
         entries = (
-            f"{n} {error:.3g} ({', '.join(f'{of[n]:.3g}' for of in simple)})"
+            f"{n} {_number(error)} ({', '.join(_number(of[n]) for of in simple)})"
             for n, error in errors[quantity].items()
         )
         lines.append(f"  {quantity:13s} {'   '.join(entries)}")
@@ -124,6 +125,11 @@ def robot_row_text(result: dict) -> str:
         "of the value one step earlier"
     )
     return "\n".join(lines)
+
+
+def _number(error: float | None) -> str:
+    """Return an error as text; one that no held-out step tells is NaN, and None in a file."""
+    return "not known" if error is None or math.isnan(error) else f"{error:.3g}"
 
 
 def _values(episodes: TensorDictBase, quantity: str) -> torch.Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import math
 import os
 import shutil
 from pathlib import Path
@@ -108,11 +109,17 @@ def lock_folder(folder: Path) -> None:
 
 
 def _dump(value, indent: str = "") -> str:
-    """Return JSON with one entry a line, and lists of plain values on a single line."""
+    """Return JSON with one entry a line, and lists of plain values on a single line; NaN, which JSON lacks, as null."""
     inner = indent + " "
     if isinstance(value, dict) and value:
         lines = [f"{inner}{json.dumps(str(k))}: {_dump(v, inner)}" for k, v in value.items()]
         return "{\n" + ",\n".join(lines) + f"\n{indent}}}"
     if isinstance(value, list | tuple) and any(isinstance(v, dict | list | tuple) for v in value):
         return "[\n" + ",\n".join(inner + _dump(v, inner) for v in value) + f"\n{indent}]"
-    return json.dumps(value)
+    if isinstance(value, list | tuple):
+        return json.dumps([_finite(v) for v in value])
+    return json.dumps(_finite(value), allow_nan=False)
+
+
+def _finite(value):
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -28,7 +28,7 @@ def test_task_1s_expert_meets_the_obstacle_of_task_2(tmp_path, monkeypatch):
     ]
     result = run(tmp_path, "evaluate", *arguments, "--eval.split", "validation", *ONE_THREAD)
     assert result.returncode == 0, result.stderr
-    name = f"balance_reaching_obstacle_balance_reaching_{list_checkpoints('balance_reaching')[-1]}_validation"
+    name = f"balance_reaching_obstacle_balance_reaching_{list_checkpoints('balance_reaching')[-1]}_validation_20_episodes"
     rates = read_json(tmp_path / f"runs/evaluate/{name}/eval.json")["rates"]
     assert 20 < rates["straight_path_blocked"] < 80
     assert rates["touched"] > 20
@@ -71,11 +71,13 @@ def test_a_run_and_its_copy_for_lerobot_get_the_same_row(trained, tmp_path):
     common = "--eval.episodes", "3", "--eval.split", "validation", *ONE_THREAD
     result = run(tmp_path, "evaluate", "--policy", "trained", "--seed", "1", *common)
     assert result.returncode == 0, result.stderr
-    ours = read_json(tmp_path / "runs/evaluate/bin_dropping_trained_seed_1_validation/eval.json")
+    ours = read_json(tmp_path / "runs/evaluate/bin_dropping_trained_seed_1_validation_3_episodes/eval.json")
     assert ours["rows"]["first_scene_seed"] == scene_seed("validation", 0)
     summary = ours["summary"]  # an untrained policy may well tip the block into the bin
     row = f"PE {summary['PE']:.1f} mm   SR {summary['SR']:.1f} %"
-    page = (tmp_path / "runs/evaluate/bin_dropping_trained_seed_1_validation/report.html").read_text()
+    page = (
+        tmp_path / "runs/evaluate/bin_dropping_trained_seed_1_validation_3_episodes/report.html"
+    ).read_text()
     assert row in result.stdout and row in page and "data:image/gif" in page
 
     lerobot = pytest.importorskip("dynmap_rl.integrations.lerobot")
@@ -89,7 +91,9 @@ def test_a_run_and_its_copy_for_lerobot_get_the_same_row(trained, tmp_path):
 def test_the_shipped_policy_does_as_well_as_its_results_say(tmp_path):
     result = run(tmp_path, "evaluate", "--policy", "balance_reaching", "--eval.episodes", "4", *ONE_THREAD)
     assert result.returncode == 0, result.stderr
-    ours = read_json(tmp_path / "runs/evaluate/balance_reaching_balance_reaching_seed_0_test/eval.json")
+    ours = read_json(
+        tmp_path / "runs/evaluate/balance_reaching_balance_reaching_seed_0_test_4_episodes/eval.json"
+    )
     facts = read_json(
         Path(__file__).parents[2] / "recipes/results/measurements/pretrained_balance_reaching.json"
     )
@@ -103,9 +107,8 @@ def test_late_frames_bridged_or_stale(tmp_path, monkeypatch):
         late = "--delay", "6", "--jitter", "2", "--lost", "0.1", *mode
         result = run(tmp_path, "evaluate", "--policy", "balance_reaching", "--eval.episodes", "2", *late)
         assert result.returncode == 0, result.stderr
-        name = "_".join(
-            ["balance_reaching_balance_reaching_seed_0_delay_6_2_0.1_0", *(["stale"] if mode else []), "test"]
-        )
+        late = "delay_6_2_0.1_0", *(["stale"] if mode else []), "test_2_episodes"
+        name = "_".join(["balance_reaching_balance_reaching_seed_0", *late])
         result = read_json(tmp_path / "runs/evaluate" / name / "eval.json")
         assert result["delay"] == {"steps": 6, "jitter": 2, "lost": 0.1, "error": 0} and result[
             "stale"

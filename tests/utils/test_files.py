@@ -1,5 +1,7 @@
 """Files: complete at any moment, checked when read, locked by one process."""
 
+import json
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -71,3 +73,13 @@ def test_a_folder_is_locked_by_one_process_until_it_ends(tmp_path):
         other.kill()
     lock_folder(tmp_path / "run")
     lock_folder(tmp_path / "run")
+
+
+def test_what_json_lacks_is_null(tmp_path):
+    write_json(tmp_path / "a.json", {"one": math.nan, "more": [1.0, -math.inf], "deep": [[math.nan], 2]})
+    text = (tmp_path / "a.json").read_text()
+    assert json.loads(text, parse_constant=pytest.fail) == {
+        "one": None,
+        "more": [1.0, None],
+        "deep": [[None], 2],
+    }
