@@ -71,7 +71,7 @@ class DelayFrames(gym.Wrapper, gym.utils.RecordConstructorArgs):
     """Wrapper that delays, jitters and drops the frames of a Gymnasium environment.
 
     The observation has the newest frame that has arrived. ``info["delay"]`` is the number of steps since that frame was
-    taken. ``info["arrived"]`` has all frames that arrive in this step, by their delay; it is empty where none arrives.
+    taken. ``info["arrived"]`` is a list of all frames that arrive in this step, each a tuple of its delay and the frame.
     ``reset(seed=...)`` determines the delays, too. Everything else, such as ``agent_pos``, is not delayed.
 
     Args:
@@ -121,7 +121,7 @@ class DelayFrames(gym.Wrapper, gym.utils.RecordConstructorArgs):
             self._newest = deepcopy(arrived[self._taken])  # a caller may change what it gets
         info |= {
             "delay": np.int64(self._report(self._taken)),
-            "arrived": {self._report(taken): frame for taken, frame in arrived.items()},
+            "arrived": [(self._report(taken), frame) for taken, frame in arrived.items()],
         }
         newest = deepcopy(self._newest)
         return newest if self.key is None else observation | {self.key: newest}, info

@@ -12,7 +12,7 @@ from .renderer import Renderer, Window
 from .scene import SceneRanges, choose_ranges
 from .task import Task
 from .tasks import get_task
-from .world import ACCELERATION_LIMIT, CONTROL_DT, EPISODE_STEPS, VELOCITY_LIMIT
+from .world import ACCELERATION_LIMIT, CONTROL_DT, EPISODE_STEPS, VELOCITY_LIMIT, World
 
 ACTION_LIMITS = {"position": VELOCITY_LIMIT * CONTROL_DT, "acceleration": ACCELERATION_LIMIT}
 OBS_TYPES = ("state", "pixels", "pixels_agent_pos")
@@ -122,6 +122,7 @@ class DynmapEnv(gym.Env):
         self._frames = Renderer(64) if obs_type != "state" else None
         self._large: Renderer | None = None
         self._window: Window | None = None
+        self.world: World | None = None
         limit = ACTION_LIMITS[control].astype(np.float32)
         self.action_space = spaces.Box(-limit, limit, dtype=np.float32)
         self.observation_space = self._observation_space()
@@ -141,6 +142,8 @@ class DynmapEnv(gym.Env):
         return self._observe(), self._info()
 
     def step(self, action: np.ndarray):
+        if self.world is None:
+            raise gym.error.ResetNeeded("the environment has not begun; call reset first")
         if self.control == "position":
             self.world.step(action)
         else:
@@ -161,6 +164,8 @@ class DynmapEnv(gym.Env):
             self._window = None
 
     def _draw(self) -> np.ndarray:
+        if self.world is None:
+            raise gym.error.ResetNeeded("the environment has not begun; call reset first")
         self._large = self._large or Renderer(self._render_size)
         return self._large.draw(self.world, self.task)
 

@@ -116,11 +116,17 @@ class ImaginationEnv(ModelBasedEnvBase):
         td = TensorDict({}, self.batch_size, device=self.device).update(tensordict.select(*self.constant))
         if "next" in tensordict.keys():  # what a policy has written, such as its memory
             td.update(tensordict["next"].select(*self.constant, strict=False))
+        mask = tensordict.get("_step", torch.ones(self.batch_size, dtype=torch.bool, device=self.device))
+        mask = mask.reshape(
+            -1, 1
+        )  # without those that TorchRL holds, such as ended ones in a chunk of actions
         for key, value in zip(STEP_KEYS, (latent, latent, *memory), strict=True):
-            td[key] = value
+            td[key] = torch.where(mask, value, tensordict[key])
         td = self._decode(td)
         reward = latent.new_zeros(*self.batch_size, 1)
-        return td.set("reward", reward if self.reward_function is None else self.reward_function(td))
+        if self.reward_function is not None:
+            reward = torch.where(mask, self.reward_function(td), reward)
+        return td.set("reward", reward)
 
     def _decode(self, td: TensorDict) -> TensorDict:
         states = td["predicted_latent"], td["hidden1"], td["hidden2"]

@@ -199,6 +199,10 @@ class BaseTask(ABC):
         """Return whether the episode has failed for good before its last step."""
         return False
 
+    def close(self, world: Any) -> None:
+        """Close the simulator of a world that is no longer needed; by default there is nothing to close."""
+        return None
+
     def describe(self, seed: int) -> dict[str, Any]:
         """Return the scene of a seed as JSON values, for the metadata of an episode."""
         return {}

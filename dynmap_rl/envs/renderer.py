@@ -81,21 +81,27 @@ class Window:
     """
 
     def __init__(self, size: int, fps: float):
+        self.size, self.clock, self.fps = size, pygame.time.Clock(), fps
+        self._open()
+
+    def _open(self) -> None:
         pygame.display.init()
         pygame.display.set_caption("dynmap_rl")
-        self.screen = pygame.display.set_mode((size, size))
-        self.clock, self.fps = pygame.time.Clock(), fps
+        self.screen = pygame.display.set_mode((self.size, self.size))
 
     def show(self, frame: np.ndarray) -> None:
-        """Show a frame, uint8 ``[size, size, 3]``."""
+        """Show a frame, uint8 ``[size, size, 3]``. A process has one window, which the last to show a frame takes over."""
+        if pygame.display.get_surface() is not self.screen:
+            self._open()
         self.screen.blit(pygame.image.frombuffer(frame, frame.shape[1::-1], "RGB"), (0, 0))
         pygame.event.pump()  # otherwise the system reports a window that does not respond
         pygame.display.flip()
         self.clock.tick(self.fps)
 
     def close(self) -> None:
-        """Close the window."""
-        pygame.display.quit()
+        """Close the window, if no other one has taken it over."""
+        if pygame.display.get_init() and pygame.display.get_surface() is self.screen:
+            pygame.display.quit()
 
 
 def box(x: float, y: float, angle: float, width: float, height: float) -> Polygon:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from numbers import Integral, Real
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -89,7 +89,14 @@ class Scene:
         if unknown:
             known = [f.name for f in fields(self)]
             raise ValueError(f"factors of the scene must be among {known}, got {sorted(unknown)}")
-        return replace(self, **{k: tuple(v) if k.endswith("color") else v for k, v in values.items()})
+        return replace(self, **{name: _plain(value) for name, value in values.items()})
+
+
+def _plain(value):
+    """Return numbers of NumPy as those of Python, and sequences as tuples, for JSON and comparison."""
+    if isinstance(value, np.ndarray | list | tuple):
+        return tuple(_plain(entry) for entry in value)
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def _check_color(name: str, value: Color) -> None:
@@ -237,16 +244,17 @@ def scene_seeds(split: str, count: int, start: int = 0) -> list[int]:
     return [scene_seed(split, start + i) for i in range(count)]
 
 
-def choose_ranges(own: SceneRanges | None, ranges: SceneRanges | None) -> SceneRanges | None:
+def choose_ranges(own: Any, ranges: Any) -> Any:
     """Return ``ranges``, or a task's ``own`` ones for None.
 
     Raises:
-        ValueError: scenes of ``ranges`` lack factors of the task, or the task has no ranges.
+        ValueError: ``ranges`` are of another type, their scenes lack factors of the task, or the task has no ranges.
     """
     if ranges is None:
         return own
     if own is None:
         raise ValueError("ranges have no effect in a task without ranges; leave them out")
-    if not isinstance(ranges, SceneRanges) or not issubclass(ranges.scene, own.scene):
+    fits = isinstance(ranges, SceneRanges if isinstance(own, SceneRanges) else type(own))
+    if not fits or (isinstance(own, SceneRanges) and not issubclass(ranges.scene, own.scene)):
         raise ValueError(f"ranges must be {type(own).__name__} in this task, got {type(ranges).__name__}")
     return ranges

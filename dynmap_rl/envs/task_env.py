@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from .protocol import check_world
 from .tasks import get_task
 
 
@@ -53,22 +54,28 @@ class TaskEnv(gym.Env):
                 "agent_pos": spaces.Box(-np.inf, np.inf, (len(layout.state),), np.float32),
             }
         )
-        self._draw, self.world = self.task.make_renderer(), None
+        self._draw, self.world, self._checked = self.task.make_renderer(), None, False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         """Begin the episode of a scene seed; without one, of a random seed.
 
         Raises:
-            ValueError: there are options, which scenes of this environment do not have.
+            ValueError: there are options, which scenes of this environment do not have; or what the task returns is not
+                of its layout.
         """
         if options:
             raise ValueError(f"this environment has no reset options, got {sorted(options)}")
         super().reset(seed=seed)
         scene_seed = int(self.np_random.integers(2**63)) if seed is None else seed
         self.world = self.task.begin(scene_seed, None, self.world)
+        if not self._checked:
+            check_world(self.task, self.world, np.array(self._draw(self.world)), state=False)
+            self._checked = True
         return self._observe(), self._info()
 
     def step(self, action: np.ndarray):
+        if self.world is None:
+            raise gym.error.ResetNeeded("the environment has not begun; call reset first")
         task, space = self.task, self.action_space
         if np.shape(action) != space.shape:
             raise ValueError(f"an action must have the shape {space.shape}, got {np.shape(action)}")
@@ -81,14 +88,23 @@ class TaskEnv(gym.Env):
         """uint8 ``[render_size, render_size, 3]``, or the next smaller multiple of a frame's side."""
         if self.render_mode is None:
             return None
+        if self.world is None:
+            raise gym.error.ResetNeeded("the environment has not begun; call reset first")
         frame = self._frame[:, : self._frame.shape[0]]
         times = max(1, self.render_size // len(frame))
         return frame.repeat(times, 0).repeat(times, 1)
 
+    def close(self) -> None:
+        """Close the simulator."""
+        if self.world is not None:
+            self.task.close(self.world)
+            self.world = None
+
     def _observe(self) -> dict[str, Any]:
-        self._frame, cameras = self._draw(self.world), self.task.layout.cameras
+        cameras = self.task.layout.cameras
+        self._frame = np.array(self._draw(self.world))  # a copy: a renderer may use one array
         frames = np.split(self._frame, len(cameras), axis=1)
-        pixels = {name: np.ascontiguousarray(frame) for name, frame in zip(cameras, frames, strict=True)}
+        pixels = {name: frame.copy() for name, frame in zip(cameras, frames, strict=True)}
         return {"pixels": pixels, "agent_pos": np.asarray(self.task.agent_pos(self.world), np.float32)}
 
     def _info(self) -> dict[str, bool | np.float32]:

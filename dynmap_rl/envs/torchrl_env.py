@@ -157,26 +157,44 @@ class DynmapBatchedEnv(EnvBase):
                 self.task, world, np.array(self.draw(world)) if self.draw else None, self.include_state
             )
             self._checked = True
-        # Callers may change what they get, so the last observation is kept apart.
-        if len(rows) == n:
-            self._observation = self._observe(self.worlds)
-        elif rows:
-            self._observation[mask.to(self.device)] = self._observe([self.worlds[i] for i in rows])
+        self._update(rows)
         return self._observation.clone()
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if None in self.worlds:
             raise RuntimeError("the environment has not begun; call reset first")
-        actions = tensordict["action"].detach().cpu().numpy()
+        mask = tensordict.get(
+            "_step", None
+        )  # worlds that TorchRL holds, such as ended ones in a chunk of actions
+        rows = (
+            list(range(len(self.worlds))) if mask is None else mask.reshape(-1).nonzero().flatten().tolist()
+        )
+        worlds = [self.worlds[i] for i in rows]
+        actions = tensordict["action"].detach().cpu().numpy()[rows]
         if not isinstance(self.task, Task):
             limit = np.array(self.layout.action_limit, np.float32)
             actions = actions.clip(-limit, limit)
         elif self.control == "acceleration":
-            actions = [world.action_for(a) for world, a in zip(self.worlds, actions, strict=True)]
-        self.task.step(self.worlds, actions)
-        self._observation = self._observe(self.worlds)
-        reward = torch.tensor([[self.task.reward(world)] for world in self.worlds], dtype=torch.float32)
+            actions = [world.action_for(a) for world, a in zip(worlds, actions, strict=True)]
+        self.task.step(worlds, actions)
+        self._update(rows)
+        reward = torch.zeros(*self.batch_size, 1)
+        reward[rows] = torch.tensor([[self.task.reward(world)] for world in worlds], dtype=torch.float32)
         return self._observation.clone().set("reward", reward.to(self.device))
+
+    def _update(self, rows: list[int]) -> None:
+        """Observe some of the worlds. Callers may change what they get, so the last observation is kept apart."""
+        if len(rows) == len(self.worlds):
+            self._observation = self._observe(self.worlds)
+        elif rows:
+            self._observation[rows] = self._observe([self.worlds[i] for i in rows])
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Close the worlds' simulators."""
+        for world in filter(None, self.worlds):
+            self.task.close(world)
+        self.worlds = [None] * len(self.worlds)
+        super().close(raise_if_closed=raise_if_closed)
 
     def read_dynamics(self) -> TensorDict:
         """Read the dynamics of all worlds from the simulator, for measurements.

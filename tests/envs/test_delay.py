@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers.vector import DictInfoToList
 from hypothesis import given
 from hypothesis import strategies as st
 from small import CONSTANTS, make_model
@@ -53,8 +54,18 @@ def test_an_environment_may_use_its_buffer_again():
 def test_a_caller_may_change_the_frames_that_arrive():
     env = DelayFrames(Counter(), FrameDelay(3))
     _, info = env.reset(seed=0)
-    info["arrived"][0][:] = 99
+    [(_, frame)] = info["arrived"]
+    frame[:] = 99
     assert env.step(0)[0].item() == 0
+
+
+def test_a_vector_of_environments_lists_what_arrives():
+    env = DictInfoToList(gym.vector.SyncVectorEnv([lambda: DelayFrames(Counter(), FrameDelay(1))] * 2))
+    env.reset(seed=0)
+    for t in range(3):
+        *_, infos = env.step(np.zeros(2, int))
+        taken = [[(age, int(frame[0])) for age, frame in info["arrived"]] for info in infos]
+        assert taken == [[(1, t)] if t else []] * 2
 
 
 def test_the_wrapper_needs_a_delay_and_a_frame():
@@ -72,7 +83,7 @@ def play(delay, seed=0):
     rows = [env.reset(seed=seed)]
     rows += [(step[0], step[4]) for step in (env.step(0) for _ in range(STEPS))]
     return [
-        (int(frame[0]), int(info["delay"]), {k: int(v[0]) for k, v in info["arrived"].items()})
+        (int(frame[0]), int(info["delay"]), {k: int(v[0]) for k, v in info["arrived"]})
         for frame, info in rows
     ]
 
@@ -190,7 +201,7 @@ def test_a_robot_s_actor_in_the_wrapper_without_delay_is_the_actor():
     robot.reset(observation["agent_pos"][3:])
     td = None
     for t in range(8):
-        for age, frame in info["arrived"].items():
+        for age, frame in info["arrived"]:
             robot.observe(frame, 0.05 * (t - age))
         action = robot.act(0.05 * t)
         with torch.no_grad():

@@ -13,6 +13,7 @@ from gymnasium.utils.env_checker import check_env
 
 import dynmap_rl  # noqa: F401 (registers the ids)
 from dynmap_rl.envs.gym_env import OBS_TYPES, DynmapEnv
+from dynmap_rl.envs.task_env import TaskEnv
 from dynmap_rl.envs.tasks import TASKS, get_task
 from dynmap_rl.envs.world import ACCELERATION_LIMIT, ACTION_LIMIT, EPISODE_STEPS
 from dynmap_rl.keys import GYMNASIUM_IDS
@@ -245,6 +246,23 @@ def test_human_mode_shows_every_step_in_a_window():
     env.close()
     assert not pygame.display.get_init()
     env.close()
+
+
+def test_two_windows_do_not_break_each_other():
+    first, second = make(render_mode="human", render_size=128), make(render_mode="human", render_size=96)
+    first.reset(seed=0), second.reset(seed=1)
+    first.step(np.zeros(3, np.float32))
+    second.close()
+    first.step(np.zeros(3, np.float32))
+    first.close()
+    assert not pygame.display.get_init()
+
+
+def test_an_environment_that_has_not_begun_says_so():
+    for env in (DynmapEnv(render_mode="rgb_array"), TaskEnv("balance_reaching", render_mode="rgb_array")):
+        for call in (env.render, lambda env=env: env.step(np.zeros(3, np.float32))):
+            with pytest.raises(gym.error.ResetNeeded, match="reset"):
+                call()
 
 
 @pytest.mark.slow

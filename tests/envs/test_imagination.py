@@ -98,6 +98,18 @@ def test_a_step_feeds_the_prediction_back_and_decodes_it(frames):
     assert torch.equal(out["latent"][:, 1:], out["next", "latent"][:, :-1])
 
 
+def test_what_torchrl_holds_is_not_imagined_further(frames):
+    env = ImaginationEnv(make_model(), make_start(make_model(), frames), reward=reward)
+    td = env.reset()
+    before = td.clone()
+    held = torch.tensor([True, False, True])
+    after = env.step(env.rand_action(td).set("_step", held))["next"]
+    for key in ("latent", "hidden1", ("predicted_dynamics", "position")):
+        torch.testing.assert_close(after[key][1], before[key][1])
+        assert not torch.equal(after[key][0], before[key][0])
+    assert after["reward"][1] == 0 and after["reward"][0] != 0
+
+
 def test_no_reward_is_predicted(frames):
     out = ImaginationEnv(make_model(), make_start(make_model(), frames)).rollout(3)
     assert (out["next", "reward"] == 0).all()

@@ -1,8 +1,10 @@
 """Scenes: drawn from their ranges, determined by the seed, every factor fixable."""
 
+import json
 import math
 from dataclasses import fields
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -177,6 +179,7 @@ def test_impossible_scene_raises(kind, factor):
         {"block_color": (300, -1, 0)},
         {"background_color": (1, 2)},
         {"cart_color": "red"},
+        {"cart_color": 5},
     ],
 )
 def test_impossible_factors_are_refused(factor):
@@ -187,8 +190,12 @@ def test_impossible_factors_are_refused(factor):
 def test_numbers_of_numpy_are_numbers():
     scene = Scene().replace(goal_x=np.float32(0.5))
     assert scene == Scene(goal_x=0.5) and type(scene.goal_x) is float
+    scene = Scene().replace(cart_color=np.array([1, 2, 3]))
+    assert scene == Scene(cart_color=(1, 2, 3)) and json.dumps(scene.to_dict())
 
 
 def test_ranges_are_ranges():
+    own = SimpleNamespace(length=(1, 2))  # of a task of one's own
+    assert choose_ranges(SimpleNamespace(length=(0, 9)), own) is own
     with pytest.raises(ValueError, match="SceneRanges in this task, got dict"):
         choose_ranges(SceneRanges(), {"density": (1, 2)})

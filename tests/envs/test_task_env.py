@@ -6,6 +6,7 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from own_task import own_task  # noqa: F401
+from point_task import Point
 
 from dynmap_rl.envs.task_env import TaskEnv
 from dynmap_rl.envs.tasks import get_task
@@ -58,3 +59,29 @@ def test_an_action_of_another_shape_is_refused():
     env.reset(seed=0)
     with pytest.raises(ValueError, match=r"\(3,\), got \(2,\)"):
         env.step(np.zeros(2, np.float32))
+
+
+def test_frames_are_copies_of_the_layout_s_form(monkeypatch):
+    picture = np.zeros((64, 64, 3), np.uint8)
+
+    def draw(world):
+        picture[:] = world.steps
+        return picture
+
+    monkeypatch.setattr(Point, "make_renderer", lambda task: draw)
+    env = TaskEnv("point_task:Point")
+    first = env.reset(seed=0)[0]["pixels"]["front"]
+    env.step(np.zeros(2))
+    assert (first == 0).all() and (picture == 1).all()
+    monkeypatch.setattr(Point, "make_renderer", lambda task: lambda world: np.zeros((32, 64, 3)))
+    with pytest.raises(ValueError, match="frame of the task point"):
+        TaskEnv("point_task:Point").reset(seed=0)
+
+
+def test_closing_closes_the_simulator(own_task, monkeypatch):  # noqa: F811
+    env, closed = TaskEnv(own_task), []
+    env.reset(seed=0)
+    monkeypatch.setattr(env.world.env, "close", lambda: closed.append(True))
+    env.close(), env.close()
+    assert closed == [True]
+    env.reset(seed=0)

@@ -11,7 +11,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
-from torchrl.envs import InitTracker, ParallelEnv, TransformedEnv
+from torchrl.envs import InitTracker, MultiAction, ParallelEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from dynmap_rl.envs.tasks import TASKS
@@ -151,6 +151,41 @@ def test_partial_reset_shows_the_other_worlds_as_they_are():
     for seen, world in zip(after, env.worlds, strict=True):
         np.testing.assert_array_equal(seen["state"], env.task.state(world))
         np.testing.assert_array_equal(seen["dynamics", "position"], world.position.astype(np.float32))
+
+
+def test_worlds_that_torchrl_holds_stay_as_they_are():
+    """In a chunk of actions, a world whose block falls is not judged again."""
+    env = DynmapBatchedEnv(num_envs=2, from_pixels=True, seed=0)
+    td = env.reset()
+    before = td.clone()
+    td = env.step(td.set("action", env.action_spec.high).set("_step", torch.tensor([True, False])))
+    assert [world.steps for world in env.worlds] == [1, 0]
+    for key in ("pixels", "agent_pos", "state", "done"):
+        assert torch.equal(td["next", key][1], before[key][1])
+    assert td["next", "reward"][1] == 0 and td["next", "reward"][0] != 0
+
+    seeds, turn = (
+        range(2),
+        torch.tensor([[0.02, 0, 0.05], [0, 0, 0]]),
+    )  # the first turns until the block falls
+    chunks = TransformedEnv(DynmapBatchedEnv(num_envs=2), MultiAction(dim=1))
+    td = chunks.reset(scene_seed=torch.tensor(list(seeds)))
+    chunks.step(td.set("action", turn[:, None].expand(2, 100, 3).contiguous()))
+    alone = play(DynmapBatchedEnv(num_envs=2), seeds, turn[:, None].expand(2, 100, 3))
+    fallen = int(alone["terminated"][0].squeeze(-1).float().argmax())
+    assert [world.steps for world in chunks.base_env.worlds] == [fallen + 1, 100]
+
+
+def test_closing_closes_every_world(monkeypatch):
+    closed = []
+    env = DynmapBatchedEnv(num_envs=2)
+    env.reset()
+    worlds = list(env.worlds)
+    monkeypatch.setattr(type(env.task), "close", lambda task, world: closed.append(world))
+    env.close()
+    assert closed == worlds and env.is_closed
+    with pytest.raises(RuntimeError, match="reset"):
+        env.step(env.fake_tensordict())
 
 
 def test_seed_determines_every_scene_that_follows():

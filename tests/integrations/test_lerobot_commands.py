@@ -194,9 +194,14 @@ def test_lerobot_finds_the_environment_by_itself(command, tmp_path):
         "names = [d.metadata['Name'] for d in importlib.metadata.distributions()]\n"
         "register_third_party_plugins()\n"
         "from lerobot.envs import make_env_config\n"
+        "make_env_config('dynmap', task='my_own_tasks:Mine')  # beside which the command runs\n"
         "config = make_env_config('dynmap', task='balance_reaching')\n"
         "print(json.dumps(['lerobot_env_dynmap' in names, 'lerobot_env_dynmap' in sys.modules, config.fps]))\n"
     )
-    done = command(tmp_path, script)
+    (tmp_path / "here").mkdir()
+    (tmp_path / "here/my_own_tasks.py").write_text(
+        "from dynmap_rl.envs.tasks import BalanceReaching\n\n\nclass Mine(BalanceReaching):\n    name = 'mine'\n"
+    )
+    done = command(tmp_path / "here", script)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout.splitlines()[-1]) == [True, True, 20]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from dataclasses import dataclass
 from functools import partial
 
@@ -51,6 +53,8 @@ class DynmapEnvConfig(EnvConfig):
     lost: float = 0.0
 
     def __post_init__(self):
+        if (here := os.getcwd()) not in sys.path:  # LeRobot's commands do not look here for module:Class
+            sys.path.append(here)
         layout = get_task(self.task).layout
         scene_seed(self.split, 0)
         FrameDelay(self.delay, self.jitter, self.lost)
@@ -134,4 +138,4 @@ class _ForLeRobot(gym.Wrapper):
 def make_env(gym_id: str, arguments: dict, split: str, delay: FrameDelay | None = None) -> gym.Env:
     """Make a Gymnasium environment whose seeds are as LeRobot needs them."""
     env = gym.make(gym_id, disable_env_checker=True, **arguments)
-    return _ForLeRobot(DelayFrames(env, delay) if delay else env, split)
+    return _ForLeRobot(env if delay in (None, FrameDelay()) else DelayFrames(env, delay), split)

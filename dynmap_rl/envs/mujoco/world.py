@@ -1,0 +1,74 @@
+"""One episode of a Gymnasium environment with MuJoCo."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from .bodies import Body, BodyReader
+from .rendering import FrameRenderer
+
+
+class MujocoWorld:
+    """One episode of a Gymnasium environment (see :class:`dynmap_rl.envs.protocol.SimulatedWorld`).
+
+    Args:
+        env: environment whose ``unwrapped`` has ``model`` and ``data``.
+        bodies: bodies whose dynamics are read.
+        dt: duration of a step (s).
+
+    Attributes:
+        env, model, data: the environment, and MuJoCo's model and data.
+        observation: last observation of the environment.
+        info: last ``info`` of the environment.
+        reward: last reward.
+        solved: whether any step so far was a success.
+
+    Raises:
+        ValueError: the environment has no MuJoCo model, or lacks one of the bodies.
+    """
+
+    def __init__(self, env: gymnasium.Env, bodies: Sequence[Body], dt: float):
+        self.env, self.bodies, self.dt, self.model, self.data = env, bodies, dt, None, None
+        if not (hasattr(env.unwrapped, "model") and hasattr(env.unwrapped, "data")):
+            raise ValueError(f"{env.unwrapped!r} must have MuJoCo's model and data")
+        self.attach()
+
+    def attach(self) -> None:
+        """Read and draw the environment's present model and data, which a reset may have replaced."""
+        inner = self.env.unwrapped
+        if inner.model is not self.model or inner.data is not self.data:
+            self.model, self.data = inner.model, inner.data
+            self.reader = BodyReader(self.model, self.bodies)
+            self.renderer: FrameRenderer | None = None
+
+    def begin(self, observation: Any, info: dict) -> None:
+        """Forget the last episode, after a reset of the environment."""
+        self.observation, self.info, self.reward = observation, info, 0.0
+        self.steps, self.solved, self.dropped, self.touched = 0, False, False, set()
+        self.position, self.velocity = self.reader.read(self.data)
+        self.acceleration = np.zeros_like(self.velocity)
+
+    def step(self, action: np.ndarray) -> None:
+        """Simulate one control step.
+
+        Raises:
+            ValueError: the step does not last ``dt``, as where the environment resets itself, or the simulation is unstable.
+        """
+        time, before = self.data.time, self.velocity
+        self.observation, reward, _, _, self.info = self.env.step(action)
+        self.reward, self.steps = float(reward), self.steps + 1
+        self.position, self.velocity = self.reader.read(self.data)
+        if not (np.isfinite(self.position).all() and np.isfinite(self.velocity).all()):
+            raise ValueError(f"positions are not finite after {self.steps} steps: the simulation is unstable")
+        if (elapsed := self.data.time - time) <= 0:
+            raise ValueError(
+                f"the environment resets itself in step {self.steps}; leave out its own limit of steps, and Autoreset"
+            )
+        if not np.isclose(elapsed, self.dt):
+            raise ValueError(f"fps must be {1 / elapsed:g}, the environment's, got {1 / self.dt:g}")
+        # MuJoCo's own accelerations are those of an instant, with spikes at contacts.
+        self.acceleration = (self.velocity - before) / self.dt
