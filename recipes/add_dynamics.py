@@ -126,7 +126,7 @@ def main(config: Config) -> None:
         (folder / "tracks.png").unlink(missing_ok=True)  # of another source
         if config.source.endswith(("tracks", "flow")):
             view = found["view"]
-            episode = worst_episode(found["quality"], view.names)
+            episode = worst_episode(found["quality"], found["names"])
             plot_tracks(config.dataset, view, episode, folder / "tracks.png")
     except OSError as error:  # the dataset is complete
         return print(f"no page in {folder}: {error}")

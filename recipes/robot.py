@@ -99,7 +99,7 @@ def main(config: Config) -> None:
     torch.set_num_threads(config.compute.threads)
     print(describe_pieces(data))
     load = partial(load_robot_dataset, config.dataset, steps, config.camera, config.goal, config.image_size)
-    judge, fingerprint = partial(judge_held_out, load=load), None
+    judge, fingerprint = partial(judge_held_out, load=partial(load, only="eval")), None
     episodes, constants = load()
     common = {"judge": judge, "seeds": seeds, "compute": config.compute, "logger": config.logger}
     if config.method == "joint":

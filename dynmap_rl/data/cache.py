@@ -9,8 +9,10 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import mmap
 import os
 import shutil
+import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -24,6 +26,8 @@ from dynmap_rl.utils.files import check_space
 from .decoding import Allocate
 
 FORMAT = 1  # of the entries
+# Without this flag, which Python names from 3.13 on, Linux refuses to map files that are larger than its memory.
+NORESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000 if sys.platform == "linux" else 0)
 
 
 def open_cached(
@@ -117,10 +121,14 @@ def _build(entry: Path, build: Callable[[Allocate], None]) -> None:
 
 def _map(entry: Path) -> TensorDict:
     """Map an entry. Pages that are changed are copied, so that the files stay as they are."""
+    flags = mmap.MAP_PRIVATE | NORESERVE
 
     def private(values: torch.Tensor) -> torch.Tensor:
-        flat = torch.from_file(str(values.filename), shared=False, size=values.numel(), dtype=values.dtype)
-        return flat.view(values.shape)
+        if not values.numel():
+            return torch.empty(values.shape, dtype=values.dtype)
+        with open(values.filename, "r+b") as file:
+            buffer = mmap.mmap(file.fileno(), values.numel() * values.element_size(), flags=flags)
+        return torch.frombuffer(buffer, dtype=values.dtype).view(values.shape)
 
     episodes = TensorDict.load_memmap(entry)
     data = {key: private(episodes.get(key)) for key in episodes.keys(True, True)}

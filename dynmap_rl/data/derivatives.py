@@ -41,15 +41,20 @@ def differentiate(
     if method == "central":
         velocity = np.gradient(position, time, axis=0, edge_order=2)
         return velocity, np.gradient(velocity, time, axis=0, edge_order=2)
-    mean = (time[-1] - time[0]) / (len(time) - 1)
-    # Timestamps are stored as float32: they are as uniform as its precision allows.
-    if np.abs(steps - mean).max() > 0.01 * mean + 2 * np.spacing(np.float32(time[-1])):
+    if not is_uniform(time):
         raise ValueError(
             f"must have uniform timestamps for --method savgol, got distances of {steps.min():.4g} to "
             f"{steps.max():.4g} s; use --method central"
         )
+    mean = (time[-1] - time[0]) / (len(time) - 1)
     velocity, acceleration = (savgol_filter(position, window, order, k, mean, axis=0) for k in (1, 2))
     return velocity, acceleration
+
+
+def is_uniform(time: np.ndarray) -> bool:
+    """Return whether times ``[T]`` (s) are uniform, as far as float32, in which datasets store them, allows."""
+    steps, mean = np.diff(time), (time[-1] - time[0]) / (len(time) - 1)
+    return bool(np.abs(steps - mean).max() <= 0.01 * mean + 2 * np.spacing(np.float32(time[-1])))
 
 
 def check_method(method: str, window: int, order: int) -> None:

@@ -18,7 +18,7 @@ from dynmap_rl.keys import DYNAMICS, FOUND
 from .angles import align_axes, align_turns
 from .camera import FrameSource, choose_view, read_motion
 from .demonstrations import DERIVED, META, find_layout, find_meta
-from .derivatives import check_method, differentiate
+from .derivatives import check_method, differentiate, is_uniform
 from .format.columns import new_folder, write_columns
 from .format.reading import find_dataset, read_column, read_info, read_table, spans
 from .motion import Motion
@@ -93,8 +93,8 @@ def add_dynamics(
 
     Returns:
         ``differences``, the mean absolute difference from replaced columns, ``[D]`` by quantity; ``quality`` (see
-        :func:`dynmap_rl.data.quality.judge_quality`); ``view``, the camera with all defaults, None for a state; and
-        ``episodes``, their number.
+        :func:`dynmap_rl.data.quality.judge_quality`); ``view``, the camera with all defaults, None for a state;
+        ``names``, those of the entries of the last source; and ``episodes``, their number.
 
     Raises:
         ValueError: an argument is wrong, or the dataset is damaged or does not allow it.
@@ -151,7 +151,8 @@ def add_dynamics(
                 if before.shape == values[quantity].shape:
                     differences[quantity] = np.abs(values[quantity] - before).mean(0)
         quality = judge_quality(derived)
-        found = {"differences": differences, "quality": quality, "view": view, "episodes": len(rows)}
+        found = {"differences": differences, "quality": quality, "view": view, "names": parts[-1][0]}
+        found["episodes"] = len(rows)
         if not folder:
             return found
         new = {f"dynamics.{q}": v.astype(np.float32) for q, v in values.items()}
@@ -231,6 +232,12 @@ def _check_times(
         raise ValueError(
             f"{root} must have timestamps that increase, got others in the episodes {', '.join(unordered)}; delete these "
             "(lerobot-edit-dataset), or correct the column timestamp"
+        )
+    uneven = [str(episode) for episode, own in rows.items() if not is_uniform(time[own])]
+    if uneven and "savgol" in methods:
+        raise ValueError(
+            f"{root} must have uniform timestamps for --method savgol, got others in the episodes {', '.join(uneven)}; use "
+            "--method central"
         )
 
 

@@ -83,6 +83,7 @@ def load_robot_dataset(
     camera: str | None = None,
     goal: str | None = None,
     image_size: int = 64,
+    only: str | None = None,
 ) -> tuple[dict[str, TensorDict], dict]:
     """Load training and held-out pieces of any LeRobot v3.0 dataset, with constants of normalisation.
 
@@ -99,10 +100,11 @@ def load_robot_dataset(
         camera: column of the frames, or several with commas between; by default the first camera.
         goal: ``COLUMN:ENTRIES``, such as ``observation.state:3,4``; by default no goal.
         image_size: S, a multiple of 8.
+        only: the split that is loaded, ``train`` or ``eval``; by default both are.
 
     Returns:
         The pieces by split, ``train`` and ``eval``, and the constants (``low`` and ``high`` ``[D]`` of action, goal and
-        every quantity of the dynamics). Pieces are ``[P, T]``: ``pixels`` uint8 ``[P, T, 3, S, cameras * S]``, ``action``
+        every quantity of the dynamics), which are those of the first of them. Pieces are ``[P, T]``: ``pixels`` uint8 ``[P, T, 3, S, cameras * S]``, ``action``
         ``[P, T, A]``, ``goal`` ``[P, T, G]`` (G = 0 without a goal), ``("dynamics", quantity)`` ``[P, T, D]`` for the
         columns that the dataset has, float32 in its units, ``disturbed`` bool ``[P, T, 1]`` where the dataset has such a
         column of flags, likewise ``expert_action`` ``[P, T, A]``, the action to imitate, and ``labelled`` bool
@@ -114,20 +116,37 @@ def load_robot_dataset(
     layout = describe_robot_dataset(dataset, camera, goal, min_steps=min_steps)
     root, info, splits, steps = (layout[key] for key in ("root", "info", "splits", "steps"))
     numbers, rows = _read_numbers(layout)
-    parts = {name: [] for name in splits}
-    size = image_size, image_size
-    sources = [iterate_frames(root, info, name, size=size) for name in layout["cameras"]]
+    splits = {name: members for name, members in splits.items() if only in (None, name)}
+    lengths = {episode: own.stop - own.start for episode, own in rows.items()}
+    pieces = {
+        name: [(episode, start) for episode in members for start in _starts(lengths[episode], steps)]
+        for name, members in splits.items()
+    }
+    shape = 3, image_size, image_size * len(layout["cameras"])
+    episodes = {name: _make_pieces(numbers, rows, own, steps, shape) for name, own in pieces.items()}
+    members, size = {episode for own in splits.values() for episode in own}, (image_size, image_size)
+    sources = [iterate_frames(root, info, name, size=size, only=members) for name in layout["cameras"]]
     for views in zip(*sources, strict=True):
-        episode, frames = views[0][0], np.concatenate([frames for _, frames, _ in views], 2)
-        for name in (name for name, members in splits.items() if episode in members):
-            own = {key: values[rows[episode]] for key, values in numbers.items()}
-            own["pixels"] = torch.from_numpy(frames).permute(0, 3, 1, 2)
-            own["episode"] = torch.full((len(frames),), episode)
-            own["step_count"] = torch.arange(len(frames))[:, None]
-            own = TensorDict(own, [len(frames)])
-            parts[name] += [own[start : start + steps] for start in _starts(len(frames), steps)]
-    episodes = {name: torch.stack(pieces).contiguous() for name, pieces in parts.items()}
-    return episodes, range_constants(episodes["train"])
+        frames = np.concatenate([frames for _, frames, _ in views], 2)
+        frames = torch.from_numpy(frames).permute(0, 3, 1, 2)
+        for name, own in pieces.items():
+            for i, (episode, start) in enumerate(own):
+                if episode == views[0][0]:
+                    episodes[name]["pixels"][i] = frames[start : start + steps]
+    return episodes, range_constants(next(iter(episodes.values())))
+
+
+def _make_pieces(
+    numbers: dict, rows: dict[int, slice], pieces: list[tuple[int, int]], steps: int, shape: tuple[int, ...]
+) -> TensorDict:
+    """Return pieces ``[P, T]`` of episodes, each given by its episode and its first step, with empty frames."""
+    episode, start = torch.tensor(pieces).T
+    step = start[:, None] + torch.arange(steps)
+    index = torch.tensor([rows[e].start for e, _ in pieces])[:, None] + step
+    data = {key: values[index] for key, values in numbers.items()}
+    data["pixels"] = torch.empty(len(pieces), steps, *shape, dtype=torch.uint8)
+    data["episode"], data["step_count"] = episode[:, None].repeat(1, steps), step[..., None]
+    return TensorDict(data, [len(pieces), steps])
 
 
 def _read_numbers(layout: dict) -> tuple[dict, dict[int, slice]]:

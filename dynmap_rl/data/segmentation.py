@@ -15,11 +15,16 @@ RAREST = 0.1  # share of the frames in which a colour must be seen to be that of
 
 def find_moving(frames: np.ndarray, changed: np.ndarray, ever: np.ndarray) -> np.ndarray:
     """Return masks ``[T, height, width]`` of what moves, by colour."""
-    colors = (frames // (256 // BINS)).astype(np.int32) @ np.array([BINS**2, BINS, 1], np.int32)
-    never = np.broadcast_to(~ever, colors.shape)
-    moving, still = (np.bincount(colors[where], minlength=BINS**3) for where in (changed, never))
+    colors = np.empty(frames.shape[:3], np.uint16)
+    moving, still = np.zeros((2, BINS**3), int)
+    for color, frame, where in zip(
+        colors, frames, changed, strict=True
+    ):  # arrays of all frames would be large
+        color[:] = (frame // (256 // BINS)).astype(np.uint16) @ np.array([BINS**2, BINS, 1], np.uint16)
+        moving += np.bincount(color[where], minlength=BINS**3)
+        still += np.bincount(color[~ever], minlength=BINS**3)
     likely = moving / moving.sum() > still / still.sum()
-    masks = likely[colors]
+    masks = np.stack([likely[color] for color in colors])
     for mask in masks:  # what never changes may have the same colour
         mask &= _touched(mask, ever)
     return masks

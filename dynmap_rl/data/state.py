@@ -94,6 +94,7 @@ def read_state(root: Path, info: dict, state: StateSource) -> Iterator[tuple[int
     """
     table = read_table(root, info, [state.column])
     position = read_column(root, info, table, state.column, np.float64, state.columns).numpy()
+    episodes = spans(table["episode_index"].to_numpy())
     spans_of = np.ptp(position[:, state.angles], axis=0)
     for entry, extent in zip(state.angles, spans_of, strict=True):
         if extent > 1.05 * state.period:
@@ -101,10 +102,16 @@ def read_state(root: Path, info: dict, state: StateSource) -> Iterator[tuple[int
                 f"angle {state.names[entry]} of {state.column} must stay within --period {state.period:.4g}, but spans "
                 f"{extent:.4g}; give --period 360 for degrees, and leave a continuous angle out of --angles"
             )
+        steps = [np.abs(np.diff(position[own, entry])).max(initial=0) for _, own in episodes]
+        if state.period > 4 * math.pi and extent < 1.05 * 2 * math.pi and max(steps) > math.pi:
+            raise ValueError(
+                f"angle {state.names[entry]} of {state.column} jumps by 2 pi, as radians do, got --period "
+                f"{state.period:.4g}; leave out --period"
+            )
     is_angle = np.isin(np.arange(len(state.columns)), state.angles)
     scale = np.where(is_angle, state.angle_noise, state.noise)
     position += scale * np.random.default_rng(state.seed).standard_normal(position.shape)
-    for episode, rows in spans(table["episode_index"].to_numpy()):
+    for episode, rows in episodes:
         yield episode, Motion(position[rows], state.angles, state.period)
 
 

@@ -110,8 +110,8 @@ def judge_held_out(
     Args:
         world_model: what predicts.
         policy: what acts on the world model's states.
-        load: function that returns the episodes (``train`` and ``eval``) and the constants of normalisation, such as a
-            ``functools.partial`` of :func:`dynmap_rl.data.load_robot_dataset`.
+        load: function that returns episodes, among them ``eval``, and constants of normalisation, such as a
+            ``functools.partial`` of :func:`dynmap_rl.data.load_robot_dataset` with ``only="eval"``.
 
     Returns:
         ``held_out``: :func:`prediction_errors` of every entry, and :func:`policy_errors`.

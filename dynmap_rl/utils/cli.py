@@ -29,7 +29,7 @@ HINTS = {
     **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "choose a folder that can be written to"),
     **dict.fromkeys((errno.EEXIST, errno.ENOTDIR, errno.EISDIR), "choose another path"),
 }
-OUT_OF_MEMORY = re.compile("out of memory|can't allocate memory")
+OUT_OF_MEMORY = re.compile("out of memory|can('t|not) allocate memory", re.IGNORECASE)
 MEMORY = "not enough memory; reduce the batch (windows, batch, num_envs) or the number of episodes"
 
 

@@ -1,14 +1,16 @@
 """The cache of decoded episodes: reused, rebuilt when stale, whole or missing, and never changed by its readers."""
 
 import json
+import os
 import shutil
 from collections import namedtuple
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from dynmap_rl.data import demonstrations
-from dynmap_rl.data.cache import hash_content
+from dynmap_rl.data.cache import _map, hash_content
 from dynmap_rl.data.decoding import decode_episodes
 from dynmap_rl.data.demonstrations import load_dataset, load_demonstrations
 from dynmap_rl.data.format.reading import read_info
@@ -129,3 +131,13 @@ def test_the_hubs_snapshots_share_a_cache_beside_them(copy, tmp_path, decoded):
     load_dataset(place)
     assert [path.name for path in place.parent.iterdir()] == ["0123abcd"]
     assert (tmp_path / "datasets--me--mine/dynmap_rl.cache").is_dir()
+
+
+def test_an_entry_may_be_larger_than_memory(tmp_path):
+    size = 2 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    episodes = TensorDict({}).memmap_(tmp_path / "entry")
+    episodes.make_memmap("action", (1, 1, size), dtype=torch.uint8)  # of holes, which take no place
+    mapped = _map(tmp_path / "entry")
+    assert mapped["action"].shape == (1, 1, size) and mapped["action"][0, 0, -1] == 0
+    mapped["action"][0, 0, -1] = 7  # stays in the process
+    assert _map(tmp_path / "entry")["action"][0, 0, -1] == 0

@@ -38,6 +38,18 @@ def test_rows_are_in_order_of_time(tmp_path):
     assert read_table(tmp_path, info, [], by_time=False)["index"].to_pylist() == [2, 3, 0, 1]
 
 
+def test_lists_of_fixed_and_of_variable_size_are_one_column(tmp_path):
+    """LeRobot stores the former where it records, and the latter where it merges."""
+    (tmp_path / "data/chunk-000").mkdir(parents=True)
+    for number, kind in enumerate((pa.list_(pa.float32()), pa.list_(pa.float32(), 2))):
+        column = pa.array([[number, 1.0], [number, 2.0]], kind)
+        rows = {"index": [2 * number, 2 * number + 1], "episode_index": [number] * 2, "action": column}
+        pq.write_table(pa.table(rows), tmp_path / f"data/chunk-000/file-{number:03}.parquet")
+    info = {"total_frames": 4, "features": {"action": {"shape": [2]}}}
+    table = read_table(tmp_path, info, ["action"])
+    assert read_column(tmp_path, info, table, "action").tolist() == [[0, 1], [0, 2], [1, 1], [1, 2]]
+
+
 @pytest.mark.parametrize("index", [[0, 1, 1, 2], [0, 1, 0, 1], [1, 2, 3, 4]])
 def test_an_index_that_does_not_number_the_frames_is_refused(tmp_path, index):
     (tmp_path / "data/chunk-000").mkdir(parents=True)

@@ -235,3 +235,9 @@ def test_the_expert_s_action_is_to_be_imitated(recording):
     episodes = torch.cat(list(load_robot_dataset(recording, 20)[0].values()))
     assert not torch.equal(episodes["action"], episodes["expert_action"])
     torch.testing.assert_close(find_target(episodes)[0], episodes["expert_action"])
+
+
+def test_one_split_alone(folders, splits):
+    alone, constants = load_robot_dataset(folders / "dynamics", 20, only="eval")
+    assert list(alone) == ["eval"] and (alone["eval"] == splits["eval"]).all()
+    assert len(constants["action"]["low"]) == 2

@@ -263,13 +263,36 @@ def spoil(root, column, row, entry):
 
 def test_numbers_that_are_not_used_may_be_missing(images, tmp_path):
     root = spoil(shutil.copytree(images[0], tmp_path / "state"), "observation.state", 5, 3)
+    stats = json.loads((root / "meta/stats.json").read_text())
+    stats["observation.state"]["mean"][3] = float("nan")
+    (root / "meta/stats.json").write_text(json.dumps(stats))
     add_dynamics(root, tmp_path / "fewer", columns=[0, 1])
+    copied = json.loads((tmp_path / "fewer/meta/stats.json").read_text())
+    assert np.isnan(copied["observation.state"]["mean"]).tolist() == [False, False, False, True]
     with pytest.raises(ValueError, match="observation.state .* in row 5, episode 0"):
         add_dynamics(root, tmp_path / "all")
     root = spoil(shutil.copytree(images[1], tmp_path / "old"), "dynamics.velocity", 3, 1)
     found = add_dynamics(root, tmp_path / "new", columns=[0, 1, 2], angles=[2], replace=True)
     assert found["differences"].keys() == {"position", "acceleration"}
     assert np.isfinite(read_column(tmp_path / "new", "dynamics.velocity")).all()
+
+
+def test_uneven_timestamps_are_found_before_the_frames_are_read(images, tmp_path):
+    root = shutil.copytree(images[0], tmp_path / "uneven")
+    [path] = (root / "data").rglob("*.parquet")
+    table = pq.read_table(path)
+    time, place = table["timestamp"].to_numpy().copy(), table.column_names.index("timestamp")
+    time[[40, -5]] += 0.3 / FPS  # in the second episode and in the last one
+    field = table.schema.field("timestamp")
+    pq.write_table(table.set_column(place, "timestamp", pa.array(time, field.type)), path)
+    with pytest.raises(ValueError, match="uniform .* episodes 1, 3; use --method central"):
+        add_dynamics(root, tmp_path / "tracked", source="tracks")
+    add_dynamics(root, tmp_path / "derived")
+
+
+def test_radians_that_are_said_to_be_degrees_are_refused(images, tmp_path):
+    with pytest.raises(ValueError, match="angle angle .* jumps by 2 pi, .* leave out --period"):
+        add_dynamics(images[0], tmp_path / "wrong", columns=[0, 1, 2], angles=[2], period=360)
 
 
 def test_a_dataset_is_complete_without_its_page(images, tmp_path, monkeypatch, capsys):

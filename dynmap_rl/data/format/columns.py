@@ -6,6 +6,7 @@ leaves an incomplete folder behind when it is stopped.
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from collections.abc import Iterator
@@ -16,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from dynmap_rl.utils.files import read_json, write_json
+from dynmap_rl.utils.files import read_json, write_bytes, write_json
 
 from .quiet import quiet
 from .reading import spans
@@ -104,7 +105,8 @@ def write_columns(
     write_json(output / "meta" / "info.json", info | {"features": info["features"] | features})
     for name, numbers in values.items():
         stats[name] = {key: value.tolist() for key, value in compute_stats(numbers).items()}
-    write_json(output / "meta" / "stats.json", stats)
+    # As LeRobot writes it: a column that is not used here may have NaN, which write_json would turn into null.
+    write_bytes(output / "meta" / "stats.json", json.dumps(stats, indent=4).encode())
     for name, content in replaced.items():
         if content is not None:
             write_json(output / name, content)

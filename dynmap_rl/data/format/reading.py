@@ -213,7 +213,8 @@ def read_table(root: Path, info: dict, columns: list[str], by_time: bool = True)
     """
     tables = list(iterate_tables(root, columns))
     try:
-        table = pa.concat_tables(tables) if tables else []
+        # LeRobot itself stores lists of fixed and of variable size in one dataset.
+        table = pa.concat_tables(tables, promote_options="permissive") if tables else []
     except pa.ArrowException as error:
         raise ValueError(
             f"data files of {root} must have the same columns, got others ({error}); record it again"
