@@ -18,7 +18,7 @@ table { border-collapse: collapse } td, th { padding: .15em .8em; border-bottom:
 """
 TYPES = {".png": "image/png", ".gif": "image/gif"}
 PICTURES = {  # in this order
-    "rollouts.gif": "Rollouts in closed loop, scenes of failures first",
+    "rollouts.gif": "Rollouts in closed loop, failures first",
     "figures/reconstruction.png": "Held-out frames, and their predictions from the frame before",
     "figures/dynamics.png": "Dynamics of a body along a held-out episode, true and predicted",
     "open_loop.png": "Error of open-loop predictions against the time without frames",
