@@ -106,9 +106,8 @@ def _build(entry: Path, build: Callable[[Allocate], None]) -> None:
             size = math.prod(shape) * dtype.itemsize
             check_space(temporary, size)
             values = episodes.make_memmap(key, shape, dtype=dtype)
-            if size and hasattr(
-                os, "posix_fallocate"
-            ):  # a full disk would otherwise kill the process that writes
+            # A full disk would otherwise kill the process that writes.
+            if size and hasattr(os, "posix_fallocate"):
                 with open(values.filename, "r+b") as file:
                     os.posix_fallocate(file.fileno(), 0, size)
             return values
@@ -126,7 +125,7 @@ def _map(entry: Path) -> TensorDict:
     def private(values: torch.Tensor) -> torch.Tensor:
         if not values.numel():
             return torch.empty(values.shape, dtype=values.dtype)
-        with open(values.filename, "r+b") as file:
+        with open(values.filename, "rb") as file:
             buffer = mmap.mmap(file.fileno(), values.numel() * values.element_size(), flags=flags)
         return torch.frombuffer(buffer, dtype=values.dtype).view(values.shape)
 

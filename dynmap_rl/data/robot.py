@@ -6,6 +6,7 @@ frames are resized, its episodes cut and divided, and its numbers normalised by 
 
 from __future__ import annotations
 
+from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
@@ -104,7 +105,8 @@ def load_robot_dataset(
 
     Returns:
         The pieces by split, ``train`` and ``eval``, and the constants (``low`` and ``high`` ``[D]`` of action, goal and
-        every quantity of the dynamics), which are those of the first of them. Pieces are ``[P, T]``: ``pixels`` uint8 ``[P, T, 3, S, cameras * S]``, ``action``
+        every quantity of the dynamics) of the training pieces, or of those of ``only``. Pieces are ``[P, T]``: ``pixels``
+        uint8 ``[P, T, 3, S, cameras * S]``, ``action``
         ``[P, T, A]``, ``goal`` ``[P, T, G]`` (G = 0 without a goal), ``("dynamics", quantity)`` ``[P, T, D]`` for the
         columns that the dataset has, float32 in its units, ``disturbed`` bool ``[P, T, 1]`` where the dataset has such a
         column of flags, likewise ``expert_action`` ``[P, T, A]``, the action to imitate, and ``labelled`` bool
@@ -116,6 +118,8 @@ def load_robot_dataset(
     layout = describe_robot_dataset(dataset, camera, goal, min_steps=min_steps)
     root, info, splits, steps = (layout[key] for key in ("root", "info", "splits", "steps"))
     numbers, rows = _read_numbers(layout)
+    if only not in (None, *splits):
+        raise ValueError(f"only must be one of {', '.join(splits)}, got {only!r}")
     splits = {name: members for name, members in splits.items() if only in (None, name)}
     lengths = {episode: own.stop - own.start for episode, own in rows.items()}
     pieces = {
@@ -124,15 +128,17 @@ def load_robot_dataset(
     }
     shape = 3, image_size, image_size * len(layout["cameras"])
     episodes = {name: _make_pieces(numbers, rows, own, steps, shape) for name, own in pieces.items()}
-    members, size = {episode for own in splits.values() for episode in own}, (image_size, image_size)
-    sources = [iterate_frames(root, info, name, size=size, only=members) for name in layout["cameras"]]
+    places = defaultdict(list)  # of the pieces of an episode
+    for name, own in pieces.items():
+        for i, (episode, start) in enumerate(own):
+            places[episode].append((episodes[name]["pixels"][i], start))
+    size = image_size, image_size
+    sources = [iterate_frames(root, info, name, size=size, only=places.keys()) for name in layout["cameras"]]
     for views in zip(*sources, strict=True):
         frames = np.concatenate([frames for _, frames, _ in views], 2)
         frames = torch.from_numpy(frames).permute(0, 3, 1, 2)
-        for name, own in pieces.items():
-            for i, (episode, start) in enumerate(own):
-                if episode == views[0][0]:
-                    episodes[name]["pixels"][i] = frames[start : start + steps]
+        for place, start in places[views[0][0]]:
+            place[:] = frames[start : start + steps]
     return episodes, range_constants(next(iter(episodes.values())))
 
 

@@ -17,9 +17,7 @@ def find_moving(frames: np.ndarray, changed: np.ndarray, ever: np.ndarray) -> np
     """Return masks ``[T, height, width]`` of what moves, by colour."""
     colors = np.empty(frames.shape[:3], np.uint16)
     moving, still = np.zeros((2, BINS**3), int)
-    for color, frame, where in zip(
-        colors, frames, changed, strict=True
-    ):  # arrays of all frames would be large
+    for color, frame, where in zip(colors, frames, changed, strict=True):  # all at once would be large
         color[:] = (frame // (256 // BINS)).astype(np.uint16) @ np.array([BINS**2, BINS, 1], np.uint16)
         moving += np.bincount(color[where], minlength=BINS**3)
         still += np.bincount(color[~ever], minlength=BINS**3)

@@ -136,7 +136,7 @@ def entry_names(info: dict, column: str) -> list[str]:
 def _ungroup(names: dict, size: int) -> list:
     """Return the names of groups, or of numbered entries, in order of the entries."""
     if sorted(map(str, names.values())) == sorted(map(str, range(size))):
-        return sorted(names, key=names.get)
+        return sorted(names, key=lambda name: int(names[name]))
     grouped = [(group, str(name)) for group, own in names.items() if isinstance(own, list) for name in own]
     plain = [name for _, name in grouped]
     return [f"{group}_{name}" if plain.count(name) > 1 else name for group, name in grouped]

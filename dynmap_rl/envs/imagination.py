@@ -116,10 +116,9 @@ class ImaginationEnv(ModelBasedEnvBase):
         td = TensorDict({}, self.batch_size, device=self.device).update(tensordict.select(*self.constant))
         if "next" in tensordict.keys():  # what a policy has written, such as its memory
             td.update(tensordict["next"].select(*self.constant, strict=False))
+        # Without those that TorchRL holds, such as those that have ended in a chunk of actions.
         mask = tensordict.get("_step", torch.ones(self.batch_size, dtype=torch.bool, device=self.device))
-        mask = mask.reshape(
-            -1, 1
-        )  # without those that TorchRL holds, such as ended ones in a chunk of actions
+        mask = mask.reshape(-1, 1)
         for key, value in zip(STEP_KEYS, (latent, latent, *memory), strict=True):
             td[key] = torch.where(mask, value, tensordict[key])
         td = self._decode(td)

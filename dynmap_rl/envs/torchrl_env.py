@@ -163,12 +163,9 @@ class DynmapBatchedEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if None in self.worlds:
             raise RuntimeError("the environment has not begun; call reset first")
-        mask = tensordict.get(
-            "_step", None
-        )  # worlds that TorchRL holds, such as ended ones in a chunk of actions
-        rows = (
-            list(range(len(self.worlds))) if mask is None else mask.reshape(-1).nonzero().flatten().tolist()
-        )
+        # Without the worlds that TorchRL holds, such as those that have ended in a chunk of actions.
+        mask = tensordict.get("_step", torch.ones(self.batch_size, dtype=torch.bool))
+        rows = mask.reshape(-1).nonzero().flatten().tolist()
         worlds = [self.worlds[i] for i in rows]
         actions = tensordict["action"].detach().cpu().numpy()[rows]
         if not isinstance(self.task, Task):
@@ -191,8 +188,9 @@ class DynmapBatchedEnv(EnvBase):
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Close the worlds' simulators."""
-        for world in filter(None, self.worlds):
-            self.task.close(world)
+        for world in self.worlds:
+            if world is not None:
+                self.task.close(world)
         self.worlds = [None] * len(self.worlds)
         super().close(raise_if_closed=raise_if_closed)
 

@@ -17,7 +17,6 @@ from dynmap_rl.data.augmentation import augment
 from dynmap_rl.data.windows import check_length, sample_windows
 from dynmap_rl.modules.precision import mixed_precision
 from dynmap_rl.runs.folder import (
-    compare_settings,
     load_training_state,
     plain_settings,
     save_training_state,
@@ -25,6 +24,7 @@ from dynmap_rl.runs.folder import (
 )
 from dynmap_rl.runs.loggers import log_metrics
 from dynmap_rl.utils.ranks import mean_over_ranks, rank, ranks, translate_errors
+from dynmap_rl.utils.settings import flatten
 
 from .settings import EndToEndTraining, WorldModelTraining, windows_at
 
@@ -91,11 +91,9 @@ def fit(
     one = replace(settings, updates=1)
     form = plain_settings(one) | {"seed": seed}
     if state := load_training_state(path):
-        stored = dict(state.get("form", form))
-        other = stored["seed"] != seed
-        if not hasattr(one, "seed"):
-            del stored["seed"]
-        if other or compare_settings(stored, one) or state["update"] > settings.updates:
+        # Older trainings lack settings that are younger; these have their defaults.
+        stored = flatten(plain_settings(type(one)())) | flatten(state.get("form", form))
+        if stored != flatten(form) or state["update"] > settings.updates:
             raise ValueError(f"{folder} holds a training with other settings; choose another folder")
         model.load_state_dict(state["model"])
         optimizer.load_state_dict(state["optimizer"])

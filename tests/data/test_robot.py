@@ -241,3 +241,5 @@ def test_one_split_alone(folders, splits):
     alone, constants = load_robot_dataset(folders / "dynamics", 20, only="eval")
     assert list(alone) == ["eval"] and (alone["eval"] == splits["eval"]).all()
     assert len(constants["action"]["low"]) == 2
+    with pytest.raises(ValueError, match="one of train, eval, got 'test'"):
+        load_robot_dataset(folders / "dynamics", 20, only="test")
