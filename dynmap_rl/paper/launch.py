@@ -99,7 +99,7 @@ def launch(
     cpus: float = 2,
     gpus: float = 0,
 ) -> list[str]:
-    """Execute runs in order, and print the name of each that is done.
+    """Execute runs in order, and print the name of each that is done, or why it failed, as soon as it ends.
 
     A run whose world model comes from another one of them waits for that run, while later ones go ahead, and does not
     start if that one fails.
@@ -125,10 +125,8 @@ def launch(
     failed = []
     ends = launch_ray(runs, start, cpus, gpus) if launcher == "ray" else launch_local(runs, start, workers)
     for run, message in ends:
-        if message:
-            failed.append(message)
-        else:
-            print(f"done: {run.name}", flush=True)
+        failed += [message] if message else []
+        print(message or f"done: {run.name}", flush=True)
     return failed
 
 

@@ -10,6 +10,7 @@ from dynmap_rl.utils.files import read_json, write_bytes
 
 from .source_results import (
     data_table,
+    find_repeated,
     gap_table,
     plot_data,
     plot_measures,
@@ -21,6 +22,10 @@ from .source_results import (
 from .sources import POLICIES, SOURCES
 from .tables import commits_text, join_table, p_text
 
+REPEATED = (
+    "The world models of these runs were trained again between their recurrent and their feed-forward policies, and only the "
+    "training that was measured is in the figures of measures: {}."
+)
 FORMS = {"glimpse": "the default encoder and decoder", "plain": "a plain CNN"}
 
 
@@ -39,12 +44,11 @@ def write_source_page(results: Path, tasks: list[str], architecture: str = "glim
         "Share of the gain: (SR - SR of Only-RGB) / (SR with the simulator's dynamics - SR "
         "of Only-RGB). Policies of rows with 15 copies are also trained on the states of 15 augmented copies of every "
         "demonstration. Measures are means over the world models that have been probed, and so are the rates in the "
-        "figures of measures and in rank correlations: of the simulator and Only-RGB on task 1, one world model. Several sources "
-        "are one recording with different noise, so that p is too small. Derived "
+        f"figures of measures and in rank correlations: {_measured(results)}. Several sources are one recording with different noise, so that p is too small. Derived "
         "columns have the verdict of `add_dynamics.py`, before any training, with the checks that failed. Written by "
         "`recipes/paper/sources.py --write`.",
     ]
-    written = []
+    written, repeated = [], find_repeated(results)
     for task in tasks:
         if not any(read_source(results, task, source, policy) for source in SOURCES for policy in POLICIES):
             continue
@@ -62,6 +66,7 @@ def write_source_page(results: Path, tasks: list[str], architecture: str = "glim
     written.append(results / "data.png")
     plot_data(results, "balance_reaching", written[-1])
     parts += ["## Number of demonstrations", data_table(results, "balance_reaching"), "![data](data.png)"]
+    parts += [REPEATED.format(", ".join(f"`{name}`" for name in repeated))] if repeated else []
     found = [read_json(path) for path in sorted(results.glob("*.json"))]
     commits = commits_text(Counter(result["commit"] for result in found))
     commands = sorted(
@@ -77,3 +82,8 @@ def write_source_page(results: Path, tasks: list[str], architecture: str = "glim
     written.append(results / "README.md")
     write_bytes(written[-1], ("\n\n".join(parts) + "\n").encode())
     return written
+
+
+def _measured(results: Path) -> str:
+    trained = len([*results.glob("*_world_model_*_recurrent.json")])
+    return f"{len([*results.glob('measures/*.json')])} of {trained} world models"

@@ -55,7 +55,7 @@ def measure_world_model(model: WorldModel, train: TensorDictBase, test: TensorDi
     """
     found = probe(model, train, test)
     result = {
-        "probe_position": max(float(np.mean(states["position"])) for states in found.values()),
+        "probe_position": max(float(np.nanmean(states["position"])) for states in found.values()),
         "probe_velocity": judge_states(found)["r2"],
     }
     x, y = _predictions(model, train), train["dynamics", "position"]
@@ -208,12 +208,28 @@ def measured_points(results: Path, task: str, policy: str, measure: str) -> tupl
         for seed in WORLD_MODELS:
             path = results / f"{name_run(task, source, seed, policy)}.json"
             measured = results / "measures" / f"{name_run(task, source, seed, 'recurrent')}.json"
-            if path.exists() and measured.exists():
+            if path.exists() and measured.exists() and not _is_repeated(path):
                 rows = [row for of_seed in result_rows(read_json(path)) for row in of_seed]
                 pairs.append((read_json(measured)[measure], summarize(rows)["SR"]))
         if pairs:
             points.append((*np.mean(pairs, 0).tolist(), source))
     return tuple(map(list, zip(*points, strict=True))) if points else ([], [], [])
+
+
+def find_repeated(results: Path) -> list[str]:
+    """Return the runs whose frozen world model is not the one that was measured under its name.
+
+    That is so where a world model was trained again, between its recurrent and its feed-forward policies. Measures that
+    name no world model are of the recurrent policies' one.
+    """
+    return [path.stem for path in sorted(results.glob("*_world_model_*.json")) if _is_repeated(path)]
+
+
+def _is_repeated(path: Path) -> bool:
+    name = f"{path.stem.rpartition('_')[0]}_recurrent.json"
+    owners = [read_json(p) for p in (path.parent / "measures" / name, path.parent / name) if p.exists()]
+    owner = next((o["world_model_sha256"] for o in owners if o.get("world_model_sha256")), None)
+    return owner not in (None, read_json(path).get("world_model_sha256"))
 
 
 def plot_sources(results: Path, task: str, path: Path) -> None:

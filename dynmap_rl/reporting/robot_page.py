@@ -69,7 +69,9 @@ def write_robot_report(
     from .figures import plot_reconstruction
 
     results = read_results(folder, seeds, frozen)
-    errors = {k: float(np.mean([r["held_out"][k] for r in results])) for k in results[0]["held_out"]}
+    errors = {
+        k: float(np.array([r["held_out"][k] for r in results], float).mean()) for k in results[0]["held_out"]
+    }
     described = describe_robot_dataset(dataset, camera, goal)
     names, dt = described["names"], 1 / (described["info"].get("fps") or 1)
     names = {key: names[key] for key in (*world_model.supervision, "action")}

@@ -84,7 +84,8 @@ def main(config: Config) -> None:
     failed = launch(todo, start, workers=config.workers)
     copy_quality(runs, config.results)
     copy_pictures(runs, config)
-    write(config)
+    if len(failed) < len(runs):  # something is there to write
+        write(config)
     if failed:
         raise ValueError("; ".join(failed))
     return None

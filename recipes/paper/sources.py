@@ -101,7 +101,8 @@ def main(config: Config) -> None:
     failed = launch(todo, start, workers=config.workers)
     copy_quality(runs, config.results)
     measure(config, runs)
-    write(config)
+    if len(failed) < len(runs):  # something is there to write
+        write(config)
     if failed:
         raise ValueError("; ".join(failed))
     return None
@@ -136,6 +137,7 @@ def measure(config: Config, runs: list) -> None:
     from dynmap_rl.training.dataset import find_or_record
     from dynmap_rl.utils.files import write_json
     from dynmap_rl.utils.version import find_commit
+    from dynmap_rl.utils.weights import fingerprint
 
     for task in sorted({run.task for run in runs if get_task(run.task).planar}):
         own = [c for c in runs if c.task == task and c.recipe == "decoupled" and not c.needs]
@@ -147,6 +149,7 @@ def measure(config: Config, runs: list) -> None:
         for name in todo:
             model, _ = load_world_model_of(config.runs / name)
             found = measure_world_model(model, episodes["train"][: config.probe_episodes], episodes["eval"])
+            found |= {"world_model_sha256": fingerprint(model)}
             write_json(paths[name], found | {"command": command_line(sys.argv), "commit": find_commit()})
 
 

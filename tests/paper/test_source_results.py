@@ -7,8 +7,14 @@ from small import CONSTANTS, make_episodes, make_model
 from dynmap_rl.evaluation.statistics import welch_interval
 from dynmap_rl.modules.checkpoints import make_world_model
 from dynmap_rl.paper import source_results
-from dynmap_rl.paper.source_results import gap_table, measure_world_model, rank_correlations
-from dynmap_rl.utils.files import write_json
+from dynmap_rl.paper.source_results import (
+    find_repeated,
+    gap_table,
+    measure_world_model,
+    measured_points,
+    rank_correlations,
+)
+from dynmap_rl.utils.files import read_json, write_json
 
 
 @pytest.fixture
@@ -107,3 +113,22 @@ def test_rank_correlations_are_over_the_sources(tmp_path):
         "recurrent, probe_velocity": pytest.approx(-1),
         "recurrent, open_loop_mm": pytest.approx(-1),
     }
+
+
+def test_policies_on_another_training_of_a_world_model_are_not_paired_with_its_measures(tmp_path):
+    name = "balance_reaching_tracks_world_model_0"
+    for policy, model in (("recurrent", "a"), ("feedforward", "b")):
+        path = tmp_path / f"{name}_{policy}.json"
+        write_result(path, 3)
+        write_json(path, read_json(path) | {"world_model_sha256": model})
+    measures = dict.fromkeys(("probe_position", "probe_velocity", "open_loop_mm"), 0.5)
+    for measured in (measures, measures | {"world_model_sha256": "a"}):
+        write_json(tmp_path / "measures" / f"{name}_recurrent.json", measured)
+        assert find_repeated(tmp_path) == [f"{name}_feedforward"]
+        points = [
+            measured_points(tmp_path, "balance_reaching", policy, "probe_velocity")
+            for policy in ("recurrent", "feedforward")
+        ]
+        assert points == [([0.5], [60.0], ["tracks"]), ([], [], [])]
+    write_json(tmp_path / "measures" / f"{name}_recurrent.json", measures | {"world_model_sha256": "b"})
+    assert find_repeated(tmp_path) == [f"{name}_recurrent"]
