@@ -60,6 +60,7 @@ def main(config: Config) -> None:
     """Play, record and upload."""
     import torch
 
+    from dynmap_rl.data.demonstrations import META, load_meta
     from dynmap_rl.data.format.hub import check_uploadable, push_dataset
     from dynmap_rl.data.recording.human import list_shards, next_scene, open_folder, publish_episodes
     from dynmap_rl.envs.tasks import get_task
@@ -94,10 +95,12 @@ def main(config: Config) -> None:
         raise ValueError("--push_to_hub needs --record, the folder of the demonstrations")
     if config.push_to_hub:
         check_uploadable(task, layout)
-    kept, first = 0, config.scene
+    published, first = 0, config.scene
     if config.record:
         open_folder(config.record, task)
-        kept, first = len(list_shards(config.record, task)), first + next_scene(config.record, task)
+        first += next_scene(config.record, task)
+        if (config.record / META).exists():
+            published = len(load_meta(config.record)["episodes"])
     # Demonstrations are of scenes for training, and every session begins with new ones.
     split = "train" if config.record else "validation"
     session = Session(task, actor, config.expert, first, split, config.delay)
@@ -111,12 +114,12 @@ def main(config: Config) -> None:
     finally:
         window.close()
         count = len(list_shards(config.record, task)) if config.record else 0
-        if count > max(kept, 1) or (count > 1 and not config.record.exists()):
+        if count > max(published, 1):
             print(f"{count} episodes: {publish_episodes(config.record, task)}")
             folder = Path("runs/play") / config.record.name
             write_dataset_page(folder, config.record, plain_settings(config), command_line(sys.argv))
     if config.gif:
-        save_film(frames, config.gif)
+        save_film(frames, config.gif, layout.dt)
     if config.push_to_hub:
         if not config.record.exists():
             raise ValueError(
@@ -157,7 +160,7 @@ def play(config: Config, task: str, session, window, frames: list, dt: float) ->
         clock.tick(1 / dt if config.steps is None else 0)
 
 
-def save_film(frames: list, path: Path) -> None:
+def save_film(frames: list, path: Path, dt: float) -> None:
     """Write every other picture at half size, all with the same 128 colours, against flicker."""
     import numpy as np
     from PIL import Image
@@ -169,7 +172,7 @@ def save_film(frames: list, path: Path) -> None:
     colors = Image.fromarray(some).quantize(128, Image.Quantize.FASTOCTREE)
     images = [image.quantize(palette=colors, dither=Image.Dither.NONE) for image in images]
     path.parent.mkdir(parents=True, exist_ok=True)
-    images[0].save(path, save_all=True, append_images=images[1:], duration=100, loop=0)
+    images[0].save(path, save_all=True, append_images=images[1:], duration=round(2000 * dt), loop=0)
     print(f"written: {path}")
 
 

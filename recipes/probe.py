@@ -123,14 +123,14 @@ def load_world_models(runs: list[str]) -> tuple[dict, str]:
     """Load the world models of runs, by the names of their rows and, where those are equal, of the runs; and their task."""
     from collections import Counter
 
-    from dynmap_rl.envs.world import ACTION_LIMIT
+    from dynmap_rl.envs.tasks import TASKS
     from dynmap_rl.modules.supervision import row_name
     from dynmap_rl.runs.lookup import load_world_model_of
 
     models, tasks = {}, {}
     for run in dict.fromkeys(run.strip().rstrip("/") for run in runs):
         world_model, origin = load_world_model_of(run)
-        if "task" not in origin or world_model.transition.action.size != len(ACTION_LIMIT):
+        if origin.get("task") not in TASKS:
             raise ValueError(
                 f"--runs must be of tasks 1 to 3, got {run}; recipes/robot.py judges its world models itself"
             )
@@ -165,7 +165,7 @@ def describe(open_loop: dict, probes: dict, perception: dict, verdicts: dict, se
         for where, found in places.items():
             lines.append(
                 f"{name}, {where}: colour error on objects {found['object_error']:.3f}, chroma explained "
-                f"{found['chroma_explained']:.2f}, goal explained {found['goal_explained']:.2f}, background error "
+                f"{found['chroma_explained']:.2f}, goal's colour explained {found['goal_explained']:.2f}, background error "
                 f"{found['background_error']:.3f}, cart by a linear map "
                 f"{1000 * found['cart_error']:.1f} mm"
             )

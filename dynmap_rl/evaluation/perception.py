@@ -32,9 +32,9 @@ def color_errors(
     Returns:
         ``object_error``, the root mean square error of the colours of cart and block (0 to 1); ``chroma_explained``, the
         share (R^2) of the variation of their chroma, that is of the channels less their mean; ``goal_explained``, the
-        share of the goal marker's difference from the background, where the marker is visible; and
-        ``background_error``, the root mean square error on all other pixels. Of the shares, 1 is perfect; 0 is as good
-        as one chroma for all objects, and as no marker.
+        share of the difference from the background of everything in the goal's colour: of the visible marker, and of the
+        walls of tasks 2 and 3; and ``background_error``, the root mean square error on all other pixels. Of the shares, 1
+        is perfect; 0 is as good as one chroma for all objects, and as nothing in the goal's colour.
     """
     device = next(world_model.parameters()).device
     names = "object", "object_truth", "goal", "goal_truth", "blank"

@@ -8,6 +8,8 @@ from pathlib import Path
 
 from dynmap_rl.envs.delay import FrameDelay
 from dynmap_rl.envs.tasks import get_task
+from dynmap_rl.modules.supervision import row_name
+from dynmap_rl.modules.world_model import WorldModel
 from dynmap_rl.reporting.figures import plt, save_figure
 from dynmap_rl.utils.files import read_json
 
@@ -46,15 +48,29 @@ def read_delays(folder: Path) -> list[dict]:
 
     def place(result: dict) -> tuple:
         row = rows.get(result["row"], len(rows))  # policies of LeRobot come last
-        names = (result[name] for name in ("row", "policy", "run"))
+        names = result["row"], result["policy"], _run(result)
         return result["task"], row, *names, conditions.index(result["condition"])
 
     return sorted(results, key=place)
 
 
 def list_delayed_runs(results: list[dict]) -> list[str]:
-    """Return the runs of some results, each once, in their order; the table has their numbers, from 1."""
-    return list(dict.fromkeys(result["run"] for result in results))
+    """Return the runs of some results, each seed once, in their order; the table has their numbers, from 1."""
+    return list(dict.fromkeys(map(_run, results)))
+
+
+def _run(result: dict) -> str:
+    return f"{result['run']}, seed {result['seed']}" if result.get("seed") else result["run"]
+
+
+def name_row(folder: Path, world_model: WorldModel) -> str:
+    """Return the row of a run: its supervision and, where it is not the default, training and architecture."""
+    path = folder / "eval.json"
+    source = read_json(path).get("world_model", {}) if path.exists() else {}
+    row = row_name(world_model.supervision, training := source.get("training", "decoupled"))
+    other = [training] if training == "joint" else []
+    other += [world_model.architecture] if world_model.architecture != "glimpse" else []
+    return ", ".join([row, *other])
 
 
 def find_training(folder: Path) -> dict[str, str]:
@@ -80,7 +96,7 @@ def delay_table(results: list[dict]) -> str:
             for c in cells
         ]
         names = [result[name] for name in ("task", "row", "policy")]
-        lines.append([*names, str(runs.index(result["run"]) + 1), condition_text(result), *values])
+        lines.append([*names, str(runs.index(_run(result)) + 1), condition_text(result), *values])
     return join_table(header, lines)
 
 
@@ -89,7 +105,7 @@ def delay_page(results: list[dict]) -> str:
     sizes = sorted({(result["split"], result["episodes"]) for result in results})
     scenes = ", ".join(f"{count} scenes of the split {split}" for split, count in sizes)
     commands = sorted({cell["command"] for result in results for cell in result["cells"].values()})
-    trained = {result["run"]: result["trained"].get("command") for result in results}
+    trained = {_run(result): result["trained"].get("command") for result in results}
     runs = [
         f"{i}. `{run}`: " + (f"`{trained[run]}`" if trained[run] else "ships with the package")
         for i, run in enumerate(list_delayed_runs(results), 1)
@@ -129,7 +145,7 @@ def plot_delays(results: list[dict], path: Path) -> None:
         results: see :func:`read_delays`.
         path: file to write.
     """
-    lines = {_text(r): r for r in results if len(r["cells"]) > 4}
+    lines = [result for result in results if len(result["cells"]) > 4]
     figure, axis = plt.subplots(figsize=(7.5, 3), layout="constrained")
     if lines:
         _draw_lines(axis, lines)
@@ -184,10 +200,9 @@ def _milliseconds(result: dict, steps: int | str) -> int:
 def _dots(results: list[dict]) -> dict[str, dict[str, dict[str, dict]]]:
     """Return the cells of each panel of dots, by their line and their marker."""
     panels = {}
-    for result in _choose_runs(results):
+    shown = [r for r in results if r["policy"] != "LeRobot" and r["condition"] != "past_actions"]
+    for result in _choose_runs(shown):
         task, row, policy, condition = (result[name] for name in ("task", "row", "policy", "condition"))
-        if policy == "LeRobot" or condition == "past_actions":
-            continue
         for steps, cell in sorted(result["cells"].items(), key=lambda item: int(item[0])):
             time, text = _milliseconds(result, steps), condition_text(result)
             if condition in ("stale", "imagined"):
@@ -206,7 +221,7 @@ def _choose_runs(results: list[dict]) -> list[dict]:
     rows = {}
     for result in results:
         runs = rows.setdefault((result["task"], result["row"], result["policy"]), {})
-        runs.setdefault(result["run"], []).append(result)
+        runs.setdefault(_run(result), []).append(result)
     return [
         result
         for runs in rows.values()
@@ -222,14 +237,14 @@ def _drop_rare(panel: dict[str, dict[str, dict]]) -> dict[str, dict[str, dict]]:
     return {line: cells for line, cells in kept.items() if cells}
 
 
-def _draw_lines(axis, lines: dict[str, dict]) -> None:
-    for label, result in lines.items():
+def _draw_lines(axis, lines: list[dict]) -> None:
+    for result in lines:
         steps = sorted(map(int, result["cells"]))
         cells = [result["cells"][str(step)] for step in steps]
         rates, errors = [cell["SR"] for cell in cells], _errors(cells)
-        style = "--" if CONDITIONS[result["condition"]][3] else "-"
+        style = {"ls": "--" if CONDITIONS[result["condition"]][3] else "-", "lw": 1.4, "elinewidth": 1}
         time = [_milliseconds(result, step) for step in steps]
-        axis.errorbar(time, rates, errors, ls=style, lw=1.4, elinewidth=1, capsize=2, marker=".", label=label)
+        axis.errorbar(time, rates, errors, capsize=2, marker=".", label=_text(result), **style)
     axis.set(xlabel="delay of the frames [ms]", ylabel="success [%]", ylim=(-3, 103))
     axis.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.02, 0.5))
 

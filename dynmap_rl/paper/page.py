@@ -69,7 +69,7 @@ interval over scenes is by bootstrap, and too narrow where few scenes differ; p 
 of its means over three policies.
 
 A comparison holds if p is below 0.05 and the interval over world models lies on the side that the claim says. It does not
-hold if that interval lies on the other side. Otherwise it is open. If one side has the same rate with every world model, as
+hold if p is below 0.05 and that interval lies on the other side. Otherwise it is open. If one side has the same rate with every world model, as
 at 100 %, the interval is that of the other side alone. If neither side varies, or one has a single world model, there is no
 interval, and the comparison is open. A claim holds if all of its comparisons hold. It does not hold if some do not and none
 holds; if some hold and some do not, it is mixed. Otherwise it is open. The paper's own gaps often have both signs. Single

@@ -85,12 +85,13 @@ class Cell:
     def summary(self) -> dict:
         """Summary over all policies on the shared start states.
 
-        ``DR`` (%), ``PE`` (mm), ``SR`` (%), ``episodes``; 95 % ``SR_interval`` over scenes; ``world_models``, the SR of
-        each; ``world_model_interval``, the 95 % interval of their mean, or None for fewer than two.
+        ``DR`` (%), ``PE`` (mm), ``SR`` (%), ``episodes``; 95 % ``SR_interval`` and ``DR_interval`` over scenes;
+        ``world_models``, the SR of each; ``world_model_interval``, the 95 % interval of their mean, or None for fewer than two.
         """
         rates = self.rates()
         return summarize([row for rows in self.policies for row in rows]) | {
             "SR_interval": shared_interval(self.policies),
+            "DR_interval": shared_interval(self.policies, "dropped"),
             "world_models": rates,
             "world_model_interval": student_interval(rates),
         }

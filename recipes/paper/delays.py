@@ -62,6 +62,7 @@ def main(config: Config) -> None:
     """Evaluate what has no result yet; draw and write."""
     import torch
 
+    from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.paper.delays import CONDITIONS, DELAYS, frame_delay
     from dynmap_rl.runs.lookup import find_run, has_world_model
 
@@ -71,10 +72,8 @@ def main(config: Config) -> None:
     if config.write:
         return write(config)
     conditions = config.conditions.split(",") if config.conditions else list(CONDITIONS)
-    if unknown := set(conditions) - set(CONDITIONS):
-        raise ValueError(
-            f"--conditions must be any of {','.join(CONDITIONS)}, got {','.join(sorted(unknown))}"
-        )
+    if unknown := ",".join(sorted(set(conditions) - set(CONDITIONS))):
+        raise ValueError(f"--conditions must be any of {','.join(CONDITIONS)}, got {unknown}")
     if not all(text.isdigit() for text in config.delays.split(",") if config.delays):
         raise ValueError(f"--delays must be numbers of steps with commas between, got {config.delays}")
     delays = [int(text) for text in config.delays.split(",")] if config.delays else DELAYS
@@ -82,11 +81,11 @@ def main(config: Config) -> None:
     for run in config.runs.split(","):
         for condition in conditions:
             path, result = open_result(config, run, condition)
-            if condition == "past_actions" and not has_world_model(find_run(run)):
-                continue
+            stateless = condition == "past_actions" and not has_world_model(find_run(run))
+            if stateless or (CONDITIONS[condition][2] and not get_task(result["task"]).planar):
+                continue  # policies of LeRobot have no world model, and only carts can be pushed
             for steps in delays:
-                delay = frame_delay(condition, steps)
-                if delay is None or str(steps) in result["cells"]:
+                if frame_delay(condition, steps) is None or str(steps) in result["cells"]:
                     continue
                 print(f"{path.stem}, {steps} steps", flush=True)
                 if not config.dry_run:
@@ -106,7 +105,8 @@ def open_result(config: Config, run: str, condition: str) -> tuple[Path, dict]:
     if not folder.exists():
         raise ValueError(f"--runs must be runs or policies, got {run}; train one with recipes/decoupled.py")
     task = config.task or task_of_run(folder) or "balance_reaching"
-    name = "_".join([get_task(task).name, *Path(run).parts[-4:], f"seed_{config.seed}", condition])
+    name = get_task(task, from_file=not config.task).name
+    name = "_".join([name, *Path(run).parts[-4:], f"seed_{config.seed}", condition])
     path = config.results / f"{name}.json"
     facts = {"run": run, "seed": config.seed, "task": task, "condition": condition}
     facts |= {"split": config.eval.split, "episodes": config.eval.episodes}
@@ -130,7 +130,7 @@ def evaluate_cell(config: Config, path: Path, result: dict, steps: int) -> None:
     from dynmap_rl.evaluation.protocol import evaluate
     from dynmap_rl.paper.delays import CONDITIONS, frame_delay
     from dynmap_rl.runs.lookup import find_run, has_world_model
-    from dynmap_rl.utils.files import write_json
+    from dynmap_rl.utils.files import read_json, write_json
     from dynmap_rl.utils.version import find_commit
 
     _, _, pushed, stale = CONDITIONS[result["condition"]]
@@ -140,9 +140,10 @@ def evaluate_cell(config: Config, path: Path, result: dict, steps: int) -> None:
     found = evaluate(actor, result["task"], config.eval, delay, pushed, workers)["test"]
     cell = {name: found["summary"][name] for name in ("SR", "SR_interval", "DR", "DR_interval", "PE")}
     cell |= {"success": found["rows"]["success"], "command": command_line(sys.argv), "commit": find_commit()}
-    result |= names
+    if path.exists():  # another process may have added cells
+        result["cells"] |= read_json(path)["cells"]
     result["cells"][str(steps)] = cell
-    write_json(path, result)
+    write_json(path, result | names)
     print(f"    SR {cell['SR']:.1f} %   DR {cell['DR']:.1f} %   PE {cell['PE']:.1f} mm", flush=True)
 
 
@@ -150,7 +151,7 @@ def load_actor(config: Config, result: dict, delay) -> tuple:
     """Return the actor of a result, which bridges a delay where one is given, and the names of its row and policy."""
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.modules.delayed_actor import DelayedActor
-    from dynmap_rl.modules.supervision import row_name
+    from dynmap_rl.paper.delays import name_row
     from dynmap_rl.runs.lookup import find_run, has_world_model, load_actor
     from dynmap_rl.training.dataset import find_or_record
     from dynmap_rl.utils.devices import choose_device
@@ -162,10 +163,9 @@ def load_actor(config: Config, result: dict, delay) -> tuple:
         actor = LeRobotActor(folder, device, get_task(result["task"]), cut=delay is not None)
         return actor, {"row": actor.policy.config.type, "policy": "LeRobot"}
     actor = load_actor(folder, config.seed).to(device)
-    names = {"row": row_name(actor.world_model.supervision), "policy": actor.policy.kind}
+    names = {"row": name_row(folder, actor.world_model), "policy": actor.policy.kind}
     if result["condition"] == "past_actions":
-        names["policy"] = "feedforward"
-        dataset = find_or_record(result["task"], config.dataset)
+        names["policy"], dataset = "feedforward", find_or_record(result["task"], config.dataset)
         return train_past_actions(folder, dataset, config.policy, config.seed), names
     return (DelayedActor(actor, max_delay=delay.longest) if delay else actor), names
 
@@ -173,10 +173,10 @@ def load_actor(config: Config, result: dict, delay) -> tuple:
 @cache
 def train_past_actions(folder: Path, dataset: str | Path, settings: PolicyTraining, seed: int):
     """Train the policy with past actions on the world model of a run; one policy serves all delays."""
-    from dynmap_rl.modules.checkpoints import load_world_model
     from dynmap_rl.paper.past_actions import make_past_actions_actor
+    from dynmap_rl.runs.lookup import load_actor
 
-    world_model = load_world_model(folder / "world_model").requires_grad_(False)
+    world_model = load_actor(folder, seed).world_model.requires_grad_(False)
     return make_past_actions_actor(world_model, dataset, settings, seed)
 
 

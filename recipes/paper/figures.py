@@ -67,7 +67,7 @@ def main(config: Config) -> None:
         except ValueError as error:
             missing.append(f"{name}: {error}")
     if drawn:
-        captions = {f"{name}.png": caption for name, (_, caption) in FIGURES.items()}
+        captions = {f"{name}.png": FIGURES[name][1] for name in drawn}
         text = "\n".join([f"drawn: {', '.join(drawn)}", *missing])
         facts = text, command_line(sys.argv), plain_settings(config), captions
         write_html(config.output, "The paper's figures", *facts)
@@ -83,8 +83,8 @@ def name_datasets(config: Config) -> dict[str, str | Path]:
         return {task: Path("datasets") / task for task in TASKS}
     folders = [name.strip() for name in config.datasets.split(",")]
     tasks = [load_meta(folder)["task"] for folder in folders]
-    if len(set(tasks)) < len(tasks):
-        raise ValueError(f"--datasets must be one of each task, got datasets of {', '.join(tasks)}")
+    if sorted(tasks) != sorted(set(tasks) & set(TASKS)):
+        raise ValueError(f"--datasets must be one of each of tasks 1 to 3, got {', '.join(tasks)}")
     return dict(zip(tasks, folders, strict=True))
 
 
@@ -123,7 +123,7 @@ def draw_fig3(config: Config, datasets: dict) -> None:
     """Draw a demonstration of each task."""
     from dynmap_rl.paper.figures import plot_film_strips, widest_ways
 
-    strips = {TASKS.get(t, t): widest_ways(load_episodes(config, datasets, t), 1)[0] for t in datasets}
+    strips = {TASKS[t]: widest_ways(load_episodes(config, datasets, t), 1)[0] for t in datasets}
     plot_film_strips(strips, config.output / "fig3.png")
 
 

@@ -2,8 +2,10 @@
 
 import matplotlib.pyplot as plt
 import pytest
+from small import CONSTANTS
 
 from dynmap_rl.envs.delay import FrameDelay
+from dynmap_rl.modules.checkpoints import make_world_model
 from dynmap_rl.paper import delays
 from dynmap_rl.utils.files import write_json
 
@@ -75,6 +77,28 @@ def test_the_dots_of_a_line_are_of_one_run(tmp_path, monkeypatch):
     found = read_lines(saved[0].axes[0])
     assert [rate for rate, _ in found["rolled forward, 500 ms"]] == [95, 95]
     plt.close("all")
+
+
+def test_policies_of_other_seeds_are_runs_of_their_own(tmp_path):
+    stale, imagined = make_results(tmp_path)
+    second = imagined | {"seed": 1}
+    rows = [line.split("|")[4].strip() for line in delays.delay_table([stale, imagined, second]).splitlines()]
+    assert rows[2:] == ["1", "1", "2"]
+    assert "2. `runs/some, seed 1`" in delays.delay_page([stale, imagined, second])
+
+
+@pytest.mark.parametrize(
+    ("training", "architecture", "row"),
+    [
+        ("decoupled", "glimpse", "RGB+[P]"),
+        ("joint", "glimpse", "RGB+[P], joint"),
+        ("end_to_end", "plain", "End-to-End, plain"),
+    ],
+)
+def test_rows_name_training_and_architecture(tmp_path, training, architecture, row):
+    write_json(tmp_path / "eval.json", {"world_model": {"training": training}})
+    world_model = make_world_model(CONSTANTS, ("position",), architecture=architecture)
+    assert delays.name_row(tmp_path, world_model) == row
 
 
 def test_conditions_of_a_run_share_a_panel(tmp_path, monkeypatch):

@@ -9,19 +9,24 @@ from small import CONSTANTS, make_model
 
 from dynmap_rl.modules.checkpoints import make_policy, save_policy, save_world_model
 from dynmap_rl.utils.files import read_json, write_json
+from recipes.paper import delays
 
 RESULTS = Path(__file__).parents[2] / "recipes/results/delays"
+
+
+def make_run(folder, task="balance_reaching"):
+    """Make a run, ``trained``, with an untrained policy."""
+    world_model = make_model()
+    save_world_model(folder / "trained/world_model", world_model)
+    policy = make_policy(CONSTANTS, "recurrent", world_model)
+    save_policy(folder / "trained/seed_0/policy", policy, world_model)
+    write_json(folder / "trained/config.json", {"task": task})
 
 
 @pytest.fixture
 def grid(tmp_path):
     """Return a function that runs the recipe on an untrained policy."""
-    world_model = make_model()
-    save_world_model(tmp_path / "trained/world_model", world_model)
-    save_policy(
-        tmp_path / "trained/seed_0/policy", make_policy(CONSTANTS, "recurrent", world_model), world_model
-    )
-    write_json(tmp_path / "trained/config.json", {"task": "balance_reaching"})
+    make_run(tmp_path)
 
     def call(*arguments):
         common = "--runs", "trained", "--eval.episodes", 2, "--results", "found", "--figure", "delays.png"
@@ -74,6 +79,28 @@ def test_published_results_can_be_extended(tmp_path):
     arguments = "--runs", "balance_reaching", "--results", "found", "--dry_run"
     result = run(tmp_path, "delays", *arguments)
     assert result.returncode == 0, result.stderr
+
+
+def test_cells_that_another_process_has_added_stay(tmp_path, monkeypatch):
+    config = delays.Config(runs="balance_reaching", results=tmp_path)
+    path, result = delays.open_result(config, "balance_reaching", "stale")
+    other = read_json(next(RESULTS.glob("balance_reaching_balance_reaching_seed_0_stale.json")))["cells"]["4"]
+    write_json(path, result | {"cells": {"4": other}})
+    names = {"row": "RGB+[P+V]", "policy": "recurrent"}
+    monkeypatch.setattr(delays, "load_actor", lambda *_: (None, names))
+    summary = dict.fromkeys(("SR", "SR_interval", "DR", "DR_interval", "PE"), 1.0)
+    found = {"test": {"summary": summary, "rows": {"success": "1"}}}
+    monkeypatch.setattr("dynmap_rl.evaluation.protocol.evaluate", lambda *_: found)
+    delays.evaluate_cell(config, path, result, 2)
+    assert set(read_json(path)["cells"]) == {"2", "4"} and read_json(path)["cells"]["4"] == other
+
+
+def test_what_a_task_in_space_cannot_have_is_left_out(tmp_path):
+    make_run(tmp_path, task="mujoco:FetchPush")
+    arguments = "--runs", "trained", "--results", "found", "--delays", "2", "--dry_run"
+    result = run(tmp_path, "delays", *arguments)
+    assert result.returncode == 0, result.stderr
+    assert "jitter" in result.stdout and "pushed" not in result.stdout
 
 
 def test_the_baseline_with_past_actions_is_trained_on_the_run_s_world_model(grid, tmp_path, recording):

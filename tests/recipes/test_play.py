@@ -10,7 +10,7 @@ from PIL import Image, ImageSequence
 from small import CONSTANTS, make_model
 
 from dynmap_rl.data.demonstrations import load_dataset, load_meta
-from dynmap_rl.data.recording.human import keep_episode, next_scene, publish_episodes
+from dynmap_rl.data.recording.human import keep_episode, next_scene
 from dynmap_rl.envs.renderer import pygame
 from dynmap_rl.envs.scene import scene_seed
 from dynmap_rl.modules.checkpoints import make_policy, save_policy, save_world_model
@@ -61,9 +61,10 @@ def test_still_parts_keep_their_colours_in_an_animation(tmp_path):
     for i in range(40):  # the right half changes to other colours
         moving = np.repeat(np.repeat(rng.integers(6 * i, 6 * i + 20, (8, 8, 3), dtype=np.uint8), 8, 0), 8, 1)
         frames.append(np.concatenate([still, moving], 1))
-    save_film(frames, tmp_path / "film.gif")
+    save_film(frames, tmp_path / "film.gif", dt=0.04)
     with Image.open(tmp_path / "film.gif") as film:
         shown = [np.asarray(frame.convert("RGB"), dtype=int) for frame in ImageSequence.Iterator(film)]
+        assert film.info["duration"] == 80, "a picture for two steps"
     assert len(shown) == 20 and shown[0].shape == (32, 64, 3)
     # The smaller picture blends the last columns with the right half.
     assert all((frame[:, :28] == shown[0][:, :28]).all() for frame in shown)
@@ -108,7 +109,9 @@ def test_later_episodes_are_added_to_a_dataset_of_ones_own_task(tmp_path, monkey
         played.step()
     assert keep_episode(tmp_path / "mine", TASK, played.episode(), played.scene_seed) == 3
     assert next_scene(tmp_path / "mine", TASK) == 8
-    publish_episodes(tmp_path / "mine", TASK)
+    arguments = "--driver", "person", "--task", TASK, "--record", "mine", "--steps", 1, "--size", 64
+    result = run(tmp_path, "play", *arguments)  # keeps none, and publishes that of a session that was killed
+    assert result.returncode == 0, result.stderr
     assert load_dataset(tmp_path / "mine", "train").shape == (2, 120)
     assert not (tmp_path / "mine.parts/old.tmp").exists()
     scenes = [row["scene_seed"] for row in load_meta(tmp_path / "mine")["episodes"]]

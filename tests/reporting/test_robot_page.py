@@ -52,3 +52,16 @@ def test_errors_are_means_over_seeds_beside_those_of_the_best_constant(folder, m
     assert write(folder, episodes)["change"]["action"]["y"] == pytest.approx(undisturbed)
     with pytest.raises(ValueError, match="another world model"):
         write(folder, episodes, frozen="seed 0")
+
+
+def test_an_entry_that_was_not_found_in_the_held_out_episodes_is_not_known(folder, monkeypatch):
+    described = {"names": NAMES, "info": {"fps": 10}}
+    monkeypatch.setattr(robot_page, "describe_robot_dataset", lambda *_: described)
+    monkeypatch.setattr("dynmap_rl.reporting.figures.plot_reconstruction", lambda *_, dt: None)
+    path = folder / "seed_1/eval.json"
+    result = read_json(path)
+    result["held_out"]["error_position_2"] = float("nan")
+    write_json(path, result)
+    episodes = make_episodes()["eval"].set("episode", torch.tensor([4, 4, 7])[:, None, None].expand(3, 12, 1))
+    assert "c not known" in robot_row_text(write(folder, episodes))
+    assert read_json(folder / "eval.json")["held_out"]["position"]["c"] is None
