@@ -96,6 +96,8 @@ def main(config: Config) -> None:
         refuse(config, Config(), ("window", "order"), "--method central")
     if not config.angles:
         refuse(config, Config(), ("period", "angle_noise"), "a state without --angles")
+    if not config.noise and not config.angle_noise:
+        refuse(config, Config(), ("noise_seed",), "no --noise")
     settings = vars(config) | {
         "columns": None if config.columns is None else parse_numbers(config.columns, "--columns"),
         "angles": [] if config.angles is None else parse_numbers(config.angles, "--angles"),

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dynmap_rl.evaluation.settings import Evaluation
-from dynmap_rl.utils.cli import command_line, parse_seeds, run_recipe
+from dynmap_rl.utils.cli import command_line, parse_seeds, refuse, run_recipe
 from dynmap_rl.utils.devices import Compute
 from dynmap_rl.utils.settings import check_at_least, check_choice
 
@@ -75,6 +75,7 @@ def main(config: Config) -> None:
     from dynmap_rl.utils.devices import choose_device
     from dynmap_rl.utils.files import read_json
 
+    refuse(config.eval, Evaluation(paper_episodes=0), ["paper_episodes"], "recipes/baseline.py", "eval.")
     task, seeds = get_task(config.task), parse_seeds(config.seeds)
     device = choose_device(config.compute.device)
     check_lerobot()

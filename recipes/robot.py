@@ -136,6 +136,10 @@ def check_config(config: Config) -> None:
             )
     if config.image_size < 8 or config.image_size % 8:
         raise ValueError(f"--image_size must be a multiple of 8, got {config.image_size}")
+    if config.image_size % 32 and config.world_model.architecture not in ("glimpse", "plain"):
+        raise ValueError(
+            f"--image_size must be a multiple of 32 with {config.world_model.architecture}, got {config.image_size}"
+        )
 
     def own(settings: type, base: type) -> list[str]:
         return [field.name for field in fields(settings) if field.name not in {f.name for f in fields(base)}]
@@ -145,6 +149,8 @@ def check_config(config: Config) -> None:
         names = own(WorldModelTraining, WorldModelArchitecture)
         refuse(config.world_model, WORLD_MODEL, names, other, "world_model.")
         refuse(config.policy, POLICY, own(PolicyTraining, PolicyArchitecture), other, "policy.")
+        if config.world_model.supervision == "none":
+            refuse(config.joint, JOINT, ["beta_dynamics"], "supervision none", "joint.")
     else:
         refuse(config.joint, JOINT, [field.name for field in fields(JointTraining)], other, "joint.")
 

@@ -51,7 +51,7 @@ def export_to_onnx(run: str | Path, folder: str | Path, seed: int = 0) -> Path:
 
     from dynmap_rl.runs.lookup import load_actor
 
-    actor, folder, batch = load_actor(run, seed).eval(), Path(folder), torch.export.Dim("batch")
+    actor, folder, batch = load_actor(run, seed).eval(), Path(folder).expanduser(), torch.export.Dim("batch")
     folder.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=folder) as temporary:  # parts of two exports would fit together
         for part, (function, sizes, outputs) in _list_parts(actor).items():
@@ -147,7 +147,7 @@ class OnnxActor:
         options = onnxruntime.SessionOptions()
         options.log_severity_level = 3  # without warnings about shapes that are merged
         options.intra_op_num_threads = options.inter_op_num_threads = threads
-        files = {part: Path(folder) / f"{part}.onnx" for part in PARTS}
+        files = {part: Path(folder).expanduser() / f"{part}.onnx" for part in PARTS}
         if missing := [file.name for file in files.values() if not file.exists()]:
             raise ValueError(f"{folder} must have {', '.join(missing)}; write them with export_to_onnx")
         self._parts = {

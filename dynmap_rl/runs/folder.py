@@ -49,8 +49,9 @@ def _open(folder: Path, config, ignore: tuple[str, ...]) -> Path:
     settings = {"format": FORMAT, **plain_settings(config)}
     path = folder / "config.json"
     untrained = {file.name for file in folder.iterdir()} <= UNTRAINED
-    if not path.exists() or (untrained and not rank()):
-        for name in INPUTS:
+    begun = path.exists()
+    if not begun or (untrained and not rank()):
+        for name in INPUTS if begun else ():  # in a folder without config.json, they are somebody else's
             (folder / name).unlink(missing_ok=True)
         write_json(path, settings)
         return folder

@@ -50,7 +50,7 @@ def run_recipe(
     # Large pages for torch's memory: small ones cost a fifth of a world model's training.
     os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
     sys.path.append(os.getcwd())  # a task named module:Class may lie here
-    given = [argument for argument in argv[1:] if argument != "--debug"]
+    given = ["--help" if argument == "-h" else argument for argument in argv[1:] if argument != "--debug"]
     debug = len(given) < len(argv) - 1
     try:
         settings = parse_settings(config_class, read_arguments(given, config_class))
@@ -163,7 +163,7 @@ def read_arguments(given: Sequence[str], config_class: type) -> list[str]:
     ``2026-01-01`` as a date; ``null`` stays None.
 
     Raises:
-        ValueError: an option is unknown.
+        ValueError: an option is unknown, or a text begins with ``include``, a word of draccus.
     """
     options, arguments, text = list_options(config_class), [], False
     for i, argument in enumerate(given):
@@ -185,6 +185,11 @@ def read_arguments(given: Sequence[str], config_class: type) -> list[str]:
 
 
 def _quote(value: str) -> str:
+    if value.startswith("include"):
+        raise ValueError(
+            f"a value must not begin with include, which draccus reads as a file to include, got {value}; write a path as "
+            f"./{value}"
+        )
     return value if value == "null" else json.dumps(value, ensure_ascii=False)
 
 

@@ -134,6 +134,54 @@ def test_policies_keep_the_world_models_that_they_were_trained_with(tmp_path):
         assert fingerprint(load_actor(tmp_path / "both", seed).world_model) == fingerprint(model)
 
 
+def test_a_checkpoint_that_is_imported_again_replaces_the_world_model(tmp_path):
+    both, exported = tmp_path / "both", []
+    for number in range(3):
+        make_run(tmp_path / f"run_{number}", "recurrent")
+        exported.append(
+            export_to_lerobot(tmp_path / f"run_{number}", tmp_path / f"exported_{number}", seed=1)
+        )
+    models = [fingerprint(load_world_model(tmp_path / f"run_{number}/world_model")) for number in range(3)]
+    for number in (0, 1):
+        import_from_lerobot(exported[number], both, seed=0)
+        assert fingerprint(load_world_model(both / "world_model")) == models[number]
+    import_from_lerobot(exported[2], both, seed=1)  # seed 0 needs the other one
+    import_from_lerobot(exported[0], both, seed=1)
+    assert [fingerprint(load_actor(both, seed).world_model) for seed in (0, 1)] == [models[1], models[0]]
+    import_from_lerobot(exported[1], both, seed=1)
+    assert not (both / "seed_1/world_model").exists()
+
+
+def test_a_stopped_import_leaves_no_policy_beside_another_world_model(tmp_path, monkeypatch):
+    both, exported = tmp_path / "both", []
+    for number in range(2):
+        make_run(tmp_path / f"run_{number}", "recurrent")
+        exported.append(
+            export_to_lerobot(tmp_path / f"run_{number}", tmp_path / f"exported_{number}", seed=1)
+        )
+    import_from_lerobot(exported[0], both, seed=0)
+    with monkeypatch.context() as stopped:
+        stopped.setattr("dynmap_rl.integrations.lerobot.export.save_policy", stop)
+        with pytest.raises(KeyboardInterrupt):
+            import_from_lerobot(exported[1], both, seed=0)
+    with pytest.raises(ValueError, match="seed_0"):
+        load_actor(both)
+    import_from_lerobot(exported[1], both, seed=0)
+    assert load_actor(both).policy is not None
+
+
+def stop(*arguments):
+    raise KeyboardInterrupt
+
+
+def test_runs_on_robot_datasets_are_not_exported(tmp_path):
+    make_run(tmp_path / "run", "recurrent")
+    write_json(tmp_path / "run/config.json", {"dataset": "someone/robot", "task": None})
+    with pytest.raises(ValueError, match="robot dataset"):
+        export_to_lerobot(tmp_path / "run", tmp_path / "exported", seed=1)
+    assert not (tmp_path / "exported").exists()
+
+
 @pytest.mark.parametrize("changes", [{"kind": "feedforward"}, {"supervision": "position,velocity"}])
 def test_weights_of_another_architecture_are_refused(tmp_path, changes):
     make_run(tmp_path / "run", "recurrent")
@@ -172,15 +220,18 @@ def test_export_and_import_name_the_folder_that_does_not_fit(tmp_path):
         import_from_lerobot(tmp_path, tmp_path / "run")
 
 
-def test_a_late_chunk_is_cut_at_the_present_step(tmp_path):
-    actor = LeRobotActor(export_to_lerobot("balance_reaching", tmp_path), cut=True)
-    calls = []
+def test_a_late_chunk_is_cut_at_the_present_step(tmp_path, monkeypatch):
+    policy, calls = export_to_lerobot("balance_reaching", tmp_path), []
+    with pytest.raises(ValueError, match="no chunks to cut"):
+        LeRobotActor(policy, cut=True)
+    monkeypatch.setattr(DynmapConfig, "n_action_steps", 2, raising=False)
+    actor = LeRobotActor(policy, cut=True)
 
     def predict(batch):
         calls.append(batch)
         return 10.0 * len(calls) + torch.arange(5.0)[None, :, None].expand(2, -1, 3)
 
-    actor.policy.predict_action_chunk, actor.policy.config.n_action_steps = predict, 2
+    actor.policy.predict_action_chunk = predict
     td = TensorDict(
         {"pixels": torch.zeros(2, 3, 64, 64, dtype=torch.uint8), "agent_pos": torch.zeros(2, 5)}, [2]
     )

@@ -62,6 +62,16 @@ def test_windows_are_those_of_our_own_loader(recording):
         assert windows["collector", "mask"][row].tolist() == there
 
 
+def test_weights_of_imagenet_are_loaded_where_a_training_begins_alone(recording, tmp_path, monkeypatch):
+    loaded = []
+    monkeypatch.setattr("dynmap_rl.integrations.lerobot.modeling_dynmap.load_imagenet", loaded.append)
+    policy = new_policy(recording, architecture="resnet18_imagenet")
+    assert loaded == [policy.world_model.encoder]
+    policy.save_pretrained(tmp_path)
+    new_policy(recording, architecture="resnet18_imagenet", pretrained_path=tmp_path)
+    assert len(loaded) == 1
+
+
 def test_what_was_not_found_in_the_frames_is_not_labelled(recording, tmp_path):
     root = tmp_path / "tracks"
     add_dynamics(recording, root, source="tracks", replace=True)
@@ -202,6 +212,7 @@ def test_late_frames_and_chunks(recording, kind, tmp_path):
         ({"kind": "transformer"}, "transformer"),
         ({"architecture": "mlp"}, "architecture must be one of .*glimpse.*'mlp'"),
         ({"window_steps": 1}, "window_steps"),
+        ({"supervision": "none", "beta_dynamics": 2.0}, "beta_dynamics has no effect"),
         ({"delay": 20}, "delay"),
         ({"delay": -1}, "delay"),
     ],

@@ -49,6 +49,7 @@ def dataset(tmp_path_factory):
         ({"source": "tracks", "width": float("inf")}, "--width"),
         ({"source": "tracks", "objects": 300}, "--objects"),
         ({"noise": -1.0}, "--noise"),
+        ({"noise_seed": 1}, "--noise_seed has no effect"),
         ({"noise": float("nan")}, "--noise"),
         ({"angles": "2", "period": 0.0}, "--period must be above 0"),
         ({"angles": "2", "period": 1.0}, "--period 360 for degrees"),

@@ -48,3 +48,9 @@ def test_a_stopped_run_goes_on_at_its_last_checkpoint(train, tmp_path):
 def test_a_failed_training_ends_with_the_last_line_of_its_log(train):
     with pytest.raises(ValueError, match="ends with: no memory"):
         train(code=1)
+
+
+def test_episodes_that_no_page_would_show_are_refused():
+    settings = baseline.Evaluation(paper_episodes=50)
+    with pytest.raises(ValueError, match="--eval.paper_episodes"):
+        baseline.main(baseline.Config(eval=settings))

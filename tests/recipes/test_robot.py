@@ -101,6 +101,19 @@ def test_a_dataset_without_dynamics_trains_on_its_frames_in_permuted_colours(dat
             ["--dataset", "gliding", "--method", "joint", "--policy.corrections", "1"],
             "--policy.corrections has no effect",
         ),
+        (
+            ["--dataset", "gliding", "--image_size", "72", "--world_model.architecture", "vit"],
+            "--image_size must be a multiple of 32 with vit",
+        ),
+        (
+            [
+                "--dataset=gliding",
+                "--method=joint",
+                "--world_model.supervision=none",
+                "--joint.beta_dynamics=2",
+            ],
+            "--joint.beta_dynamics has no effect",
+        ),
     ],
 )
 def test_bad_input_is_refused_before_anything_is_written(datasets, arguments, message):

@@ -61,6 +61,12 @@ def test_a_run_that_has_not_begun_to_train_may_get_other_settings(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {".lock", "config.json"}
 
 
+def test_files_in_a_folder_that_is_no_run_are_kept(tmp_path):
+    write_json(tmp_path / "dataset.json", {"of": "somebody"})
+    open_run(tmp_path, Settings())
+    assert read_json(tmp_path / "dataset.json") == {"of": "somebody"}
+
+
 def test_a_run_that_is_older_than_a_setting_has_its_default(tmp_path):
     open_run(tmp_path, Settings())
     append_metrics(tmp_path, 1)

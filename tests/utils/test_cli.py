@@ -72,16 +72,26 @@ def test_a_nested_option_leaves_the_other_defaults_of_its_group(run):
     assert run("--second.updates", "7") == Settings(second=Group(7, 0.5))
 
 
-def test_the_help_shows_the_defaults_that_apply(run, capsys):
+@pytest.mark.parametrize("arguments", [("--output", "include_all"), ("--policy=include x",)])
+def test_a_word_of_draccus_is_refused(run, capsys, arguments):
     with pytest.raises(SystemExit):
-        run("--help")
+        run(*arguments)
+    assert "./include" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["--help", "-h"])
+def test_the_help_shows_the_defaults_that_apply(run, capsys, option):
+    with pytest.raises(SystemExit):
+        run(option)
     lines = " ".join(capsys.readouterr().out.split())
     assert "--first.rate float Some rate. (default: 0.1)" in lines
     assert "--second.rate float Some rate. (default: 0.5)" in lines
     assert __doc__ in lines and "--debug" in lines
 
 
-@pytest.mark.parametrize("arguments", [("--policy", "run", "--help"), ("--help", "--policy", "run")])
+@pytest.mark.parametrize(
+    "arguments", [("--policy", "run", "--help"), ("--help", "--policy", "run"), ("--policy", "run", "-h")]
+)
 def test_the_help_is_shown_beside_other_options(run, capsys, arguments):
     with pytest.raises(SystemExit) as stopped:
         run(*arguments)

@@ -70,6 +70,11 @@ class LeRobotActor(TensorDictModuleBase):
             raise ValueError(
                 f"cut must be False for the policy type {config.type}, which predicts from {config.n_obs_steps} observations"
             )
+        if cut and not hasattr(config, "n_action_steps"):
+            raise ValueError(
+                f"cut must be False for the policy type {config.type}, which has no chunks to cut; turn a policy dynmap into "
+                "a run with import_from_lerobot"
+            )
         if task:
             check_config(config, task)
             if not task.planar:

@@ -52,8 +52,8 @@ class DynmapConfig(PreTrainedConfig):
         source: origin of the world model (see :func:`dynmap_rl.runs.load_world_model_of`); written by training.
 
     Raises:
-        ValueError: supervision or kind is unknown, windows have less than two steps, or ``delay`` is not below
-            ``chunk_size``.
+        ValueError: supervision or kind is unknown, windows have less than two steps, ``delay`` is not below
+            ``chunk_size``, or ``beta_dynamics`` has no effect.
     """
 
     supervision: str = "position,velocity"
@@ -88,7 +88,7 @@ class DynmapConfig(PreTrainedConfig):
 
     def __post_init__(self):
         super().__post_init__()
-        parse_supervision(self.supervision)
+        supervision = parse_supervision(self.supervision)
         check_policy(self.kind)
         if self.architecture not in ARCHITECTURES:
             raise ValueError(
@@ -96,6 +96,8 @@ class DynmapConfig(PreTrainedConfig):
             )
         if self.window_steps < 2:
             raise ValueError(f"--policy.window_steps must be at least 2, got {self.window_steps}")
+        if not supervision and self.beta_dynamics != 1.0:
+            raise ValueError("--policy.beta_dynamics has no effect with supervision none; leave it out")
         if not 0 <= self.delay < self.chunk_size:
             raise ValueError(
                 f"--policy.delay must be at least 0 and below --policy.chunk_size, got {self.delay} and {self.chunk_size}"

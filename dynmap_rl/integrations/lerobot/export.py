@@ -12,7 +12,7 @@ from safetensors import SafetensorError
 
 from dynmap_rl.keys import CAMERA, FRAME_SHAPE
 from dynmap_rl.modules.checkpoints import load_world_model, save_policy, save_world_model
-from dynmap_rl.runs.lookup import find_run, load_actor
+from dynmap_rl.runs.lookup import find_run, load_actor, task_of_run
 from dynmap_rl.utils.files import read_json, write_json
 from dynmap_rl.utils.hub import first_line
 from dynmap_rl.utils.weights import fingerprint
@@ -38,17 +38,16 @@ def export_to_lerobot(run: str | Path, folder: str | Path, seed: int = 0) -> Pat
         ValueError: the run has no policy of that seed, or was trained on a robot dataset.
     """
     folder, run = Path(folder).expanduser(), find_run(run)
-    actor = load_actor(run, seed)
+    task, actor = task_of_run(run), load_actor(run, seed)
     world_model, policy = actor.world_model, actor.policy
     sizes = {"action": policy.action.size, "goal": policy.goal.size}
     sizes |= {"image_size": world_model.image_size, "cameras": world_model.cameras}
     expected = DynmapConfig().sizes | {"image_size": FRAME_SHAPE[0], "cameras": 1}
     if other := {name: size for name, size in sizes.items() if size != expected[name]}:
         raise ValueError(f"{run} must be a run of a task of cart and block, got other sizes: {other}")
-    files = run / "config.json", run / "eval.json"
-    settings, results = (read_json(file) if file.exists() else {} for file in files)
+    results = read_json(run / "eval.json") if (run / "eval.json").exists() else {}
     config = DynmapConfig(
-        task=settings.get("task"),
+        task=task,
         source=results.get("world_model"),
         supervision=",".join(world_model.supervision) or "none",
         kind=policy.kind,
@@ -80,9 +79,9 @@ def import_from_lerobot(folder: str | Path, run: str | Path, seed: int = 0) -> P
 
     Args:
         folder: written by :func:`export_to_lerobot` or by ``lerobot-train --policy.type=dynmap``.
-        run: run folder; gets ``world_model`` and ``seed_N/policy``. Where it has another world model already, of another
-            training with LeRobot, the policy's own is ``seed_N/world_model``.
-        seed: seed under which the policy is stored.
+        run: run folder; gets ``world_model`` and ``seed_N/policy``. Where a policy of another seed needs the world model
+            that is there, of another training with LeRobot, the policy's own is ``seed_N/world_model``.
+        seed: seed under which the policy is stored, in the place of one that is there.
 
     Returns:
         The run folder.
@@ -100,7 +99,7 @@ def import_from_lerobot(folder: str | Path, run: str | Path, seed: int = 0) -> P
     if not isinstance(config, DynmapConfig):
         raise ValueError(f"{folder} must hold a policy of the type dynmap, got {config.type}")
     source = config.source or {}
-    settings = {"task": config.task} | ({"dataset": source["dataset"]} if "dataset" in source else {})
+    settings = {"task": config.task}
     if (run / "config.json").exists() and read_json(run / "config.json") != settings:
         raise ValueError(f"{run} holds another run; choose another folder")
     try:
@@ -108,11 +107,13 @@ def import_from_lerobot(folder: str | Path, run: str | Path, seed: int = 0) -> P
     except (OSError, SafetensorError) as error:
         raise ValueError(f"{folder} holds no weights that can be read ({first_line(error)})") from error
     write_json(run / "config.json", settings)
-    first, own = run / "world_model", run / f"seed_{seed}" / "world_model"
-    shutil.rmtree(own, ignore_errors=True)
-    shared = not first.exists() or fingerprint(load_world_model(first)) == fingerprint(policy.world_model)
-    save_world_model(first if shared else own, policy.world_model)
-    save_policy(run / f"seed_{seed}" / "policy", policy.policy, policy.world_model)
+    seed_folder, first = run / f"seed_{seed}", run / "world_model"
+    others = [policy.parent for policy in run.glob("seed_*/policy") if policy.parent != seed_folder]
+    needed = first.exists() and any(not (other / "world_model").exists() for other in others)
+    shared = not needed or fingerprint(load_world_model(first)) == fingerprint(policy.world_model)
+    shutil.rmtree(seed_folder, ignore_errors=True)  # a policy must never lie beside another world model
+    save_world_model(first if shared else seed_folder / "world_model", policy.world_model)
+    save_policy(seed_folder / "policy", policy.policy, policy.world_model)
     if source:
         write_json(run / "eval.json", {"world_model": source, "imported_from": str(folder)})
     return run

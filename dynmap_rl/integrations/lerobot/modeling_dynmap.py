@@ -82,7 +82,8 @@ class DynmapPolicy(PreTrainedPolicy):
                 self.register_buffer(name, columns["dynamics", name], persistent=False)
         sizes = config.latent_size, config.hidden_size, config.architecture
         self.world_model = make_world_model(constants, parse_supervision(config.supervision), *sizes)
-        if dataset_meta is not None and config.architecture == "resnet18_imagenet":
+        begins = dataset_meta is not None and not config.pretrained_path
+        if begins and config.architecture == "resnet18_imagenet":
             load_imagenet(self.world_model.encoder)
         width = {"width": config.width} if config.width else {}
         self.policy = make_policy(constants, config.kind, self.world_model, **width)
