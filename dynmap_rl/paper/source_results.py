@@ -160,13 +160,12 @@ def gap_table(results: Path, task: str) -> str:
 
     The 95 % intervals (Welch's t) are over world models and are left out where there are too few.
     """
-    lines = []
+    lines, full = [], {policy: read_source(results, task, "simulator", policy) for policy in POLICIES}
     for name, source in SOURCES.items():
         gaps = []
         for policy in POLICIES:
-            cell, full = (read_source(results, task, s, policy) for s in (name, "simulator"))
-            both = cell and full and name != "simulator"
-            gaps.append(gap_text(cell["world_models"], full["world_models"]) if both else "")
+            both = full[policy] and name != "simulator" and (cell := read_source(results, task, name, policy))
+            gaps.append(gap_text(cell["world_models"], full[policy]["world_models"]) if both else "")
         if any(gaps):
             lines.append([source.text, *gaps])
     return join_table(["points of SR more than with the simulator's dynamics", *POLICIES], lines)
@@ -190,19 +189,18 @@ def rank_correlations(results: Path, task: str) -> dict[str, dict[str, float]]:
     """
     correlations = {}
     for policy in POLICIES:
-        for name in MEASURES:
-            x, y, _ = measured_points(results, task, policy, name)
-            if len(x) >= FEWEST:
-                random = PermutationMethod(rng=np.random.default_rng(0))
-                found = pearsonr(rankdata(x), rankdata(y), method=random)
-                numbers = {"rho": float(found.statistic), "p": float(found.pvalue), "sources": len(x)}
-                correlations[f"{policy}, {name}"] = numbers
+        _, rates, measures = measured_points(results, task, policy)
+        for name, values in measures.items() if len(rates) >= FEWEST else ():
+            random = PermutationMethod(rng=np.random.default_rng(0))
+            found = pearsonr(rankdata(values), rankdata(rates), method=random)
+            numbers = {"rho": float(found.statistic), "p": float(found.pvalue), "sources": len(rates)}
+            correlations[f"{policy}, {name}"] = numbers
     return correlations
 
 
-def measured_points(results: Path, task: str, policy: str, measure: str) -> tuple[list, list, list]:
-    """Return a measure, SR and name of every source, means over the world models that have both."""
-    points = []
+def measured_points(results: Path, task: str, policy: str) -> tuple[list, list, dict[str, list]]:
+    """Return name, SR and measures of every source, means over the world models that have both."""
+    names, points = [], []
     for source in SOURCES:
         pairs = []
         for seed in WORLD_MODELS:
@@ -210,10 +208,13 @@ def measured_points(results: Path, task: str, policy: str, measure: str) -> tupl
             measured = results / "measures" / f"{name_run(task, source, seed, 'recurrent')}.json"
             if path.exists() and measured.exists() and not _is_repeated(path):
                 rows = [row for of_seed in result_rows(read_json(path)) for row in of_seed]
-                pairs.append((read_json(measured)[measure], summarize(rows)["SR"]))
+                found = read_json(measured)
+                pairs.append([summarize(rows)["SR"], *(found[name] for name in MEASURES)])
         if pairs:
-            points.append((*np.mean(pairs, 0).tolist(), source))
-    return tuple(map(list, zip(*points, strict=True))) if points else ([], [], [])
+            names.append(source)
+            points.append(np.mean(pairs, 0).tolist())
+    rates, *values = map(list, zip(*points, strict=True)) if points else [[]] * (1 + len(MEASURES))
+    return names, rates, dict(zip(MEASURES, values, strict=True))
 
 
 def find_repeated(results: Path) -> list[str]:
@@ -274,11 +275,12 @@ def plot_data(results: Path, task: str, path: Path) -> None:
 def plot_measures(results: Path, task: str, path: Path) -> None:
     """Draw SR against each cheap measure, a colour for each kind of source, with the rank correlation."""
     correlations = rank_correlations(results, task)
+    points = {policy: measured_points(results, task, policy) for policy in POLICIES}
     figure, axes = plt.subplots(1, len(MEASURES), figsize=(11, 4.6), sharey=True, layout="constrained")
     for axis, (measure, (text, _)) in zip(axes, MEASURES.items(), strict=True):
         title = []
-        for policy, marker in zip(POLICIES, "os", strict=True):
-            for x, y, name in zip(*measured_points(results, task, policy, measure), strict=True):
+        for marker, (policy, (names, rates, measures)) in zip("os", points.items(), strict=True):
+            for name, y, x in zip(names, rates, measures[measure], strict=True):
                 kind = next(kind for kind, names in KINDS.items() if name.startswith(names))
                 named = any(line.get_label() == kind for line in axis.lines)
                 color = f"C{list(KINDS).index(kind)}"

@@ -125,10 +125,9 @@ def test_policies_on_another_training_of_a_world_model_are_not_paired_with_its_m
     for measured in (measures, measures | {"world_model_sha256": "a"}):
         write_json(tmp_path / "measures" / f"{name}_recurrent.json", measured)
         assert find_repeated(tmp_path) == [f"{name}_feedforward"]
-        points = [
-            measured_points(tmp_path, "balance_reaching", policy, "probe_velocity")
-            for policy in ("recurrent", "feedforward")
-        ]
-        assert points == [([0.5], [60.0], ["tracks"]), ([], [], [])]
+        halves = {key: [0.5] for key in measures}
+        assert measured_points(tmp_path, "balance_reaching", "recurrent") == (["tracks"], [60.0], halves)
+        none = {key: [] for key in measures}
+        assert measured_points(tmp_path, "balance_reaching", "feedforward") == ([], [], none)
     write_json(tmp_path / "measures" / f"{name}_recurrent.json", measures | {"world_model_sha256": "b"})
     assert find_repeated(tmp_path) == [f"{name}_recurrent"]
