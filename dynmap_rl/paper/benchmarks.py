@@ -69,7 +69,7 @@ differ by more. The numbers of updates of the decoupled rows were chosen for eac
 runs that are not stored; those of Joint, End-to-End, ACT and Diffusion Policy are the recipes' defaults. On PlateSlide, plate and hand always
 start in the same places: the goal, which policies are given, determines what to do, so that its column says nothing about
 perception. Derived dynamics (of the hand, tracked, hand and color) are explained in
-[dynmap_rl/data/README.md](../../../dynmap_rl/data/README.md#which-source). Tasks, cameras and experts are described in
+[dynmap_rl/envs/mujoco/README.md](../../../dynmap_rl/envs/mujoco/README.md#tasks). Tasks, cameras and experts are described in
 [dynmap_rl/envs/mujoco/README.md](../../../dynmap_rl/envs/mujoco/README.md). Written by
 `python recipes/paper/benchmarks3d.py --write` from the files in this folder.
 

@@ -110,7 +110,7 @@ def markdown_claims(comparisons: list[dict]) -> str:
     Args:
         comparisons: result of :func:`compare_cells`.
     """
-    lines, missing, pairs = [], {}, list_pairs()
+    lines, verdicts, missing, pairs = [], [], {}, list_pairs()
     claims = list(dict.fromkeys(pair.claim for pair in pairs))
     parts = dict.fromkeys((pair.claim, pair.group, pair.metric) for pair in pairs)
     for part in sorted(parts, key=lambda part: claims.index(part[0])):
@@ -121,10 +121,13 @@ def markdown_claims(comparisons: list[dict]) -> str:
         counts = [str(sum(row["verdict"] == verdict for row in own)) for verdict in VERDICTS]
         unit = METRICS[part[2]][1].replace("%", "points")
         gaps = [_span([row["paper"] for row in own], 0), f"{_span([row['gap'] for row in own], 1)} {unit}"]
-        lines.append([*part, *gaps, *counts, f"**{judge_claim(own)}**"])
+        verdicts.append(judge_claim(own))
+        lines.append([*part, *gaps, *counts, f"**{verdicts[-1]}**"])
     head = ["claim", "comparisons", "metric", "the paper's gaps", "gaps", *VERDICTS, "verdict"]
     rest = "".join(f"\n- {claim}: {'; '.join(groups)}" for claim, groups in missing.items())
-    return join_table(head, lines) + (f"\n\nWithout runs so far:\n{rest}" if rest else "")
+    count = ", ".join(f"{name}: {verdicts.count(name)}" for name in (HOLDS, FAILED, MIXED, OPEN))
+    table = join_table(head, lines) + (f"\n\nWithout runs so far:\n{rest}" if rest else "")
+    return f"Verdicts on {len(lines)} claims about a metric: {count}.\n\n{table}"
 
 
 def _span(gaps: list[float], digits: int) -> str:

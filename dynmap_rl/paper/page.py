@@ -69,14 +69,15 @@ interval over scenes is by bootstrap, and too narrow where few scenes differ; p 
 of its means over three policies.
 
 A comparison holds if p is below 0.05 and the interval over world models lies on the side that the claim says. It does not
-hold if p is below 0.05 and that interval lies on the other side. Otherwise it is open. If one side has the same rate with every world model, as
-at 100 %, the interval is that of the other side alone. If neither side varies, or one has a single world model, there is no
+hold if p is below 0.05 and that interval lies on the other side. Otherwise it is open. If one side has the same rate with every
+world model, as at 100 %, the interval is that of the other side alone. If neither side varies, or one has a single world model, there is no
 interval, and the comparison is open. A claim holds if all of its comparisons hold. It does not hold if some do not and none
 holds; if some hold and some do not, it is mixed. Otherwise it is open. The paper's own gaps often have both signs. Single
 comparisons are not corrected for their number, and those with one and the same cell, such as Only-RGB, are no independent
 evidence. Scenes of two tasks have nothing in common but their number; pairing them neither helps nor harms. "Recurrent policies gain
 less by dynamics" is a difference of differences: (recurrent - feed-forward) with dynamics, minus the same for Only-RGB.
-Decoupled runs of these comparisons were trained on a CPU, joint and end-to-end ones mostly on a GPU.
+Decoupled runs of these comparisons were trained on a CPU, joint and end-to-end ones mostly on a GPU, and by an earlier form of
+the L1 loss ([L1 loss](../README.md#choices-and-deviations-from-the-paper)).
 
 Comparisons are of the default encoder unless they name a plain CNN. With the default encoder even Only-RGB nearly solves
 task 1, which leaves no room for gaps. The plain CNN is nearer to the paper, which has "a simple CNN-based encoder" and gives

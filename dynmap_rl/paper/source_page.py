@@ -9,6 +9,7 @@ from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.utils.files import read_json, write_bytes
 
 from .source_results import (
+    MEASURES,
     data_table,
     find_repeated,
     gap_table,
@@ -39,13 +40,15 @@ def write_source_page(results: Path, tasks: list[str], architecture: str = "glim
     """
     parts = [
         "# Sources of dynamics, and numbers of demonstrations",
-        f"World models have {FORMS[architecture]}. SR in % with 95 % intervals over the test scenes, which do not cover "
+        f"World models have {FORMS[architecture]}. The rows are explained in [recipes/README.md](../../README.md"
+        "#sources-of-dynamics), the verdicts of `add_dynamics.py` on derived columns, before any training, in "
+        "[dynmap_rl/data/README.md](../../../dynmap_rl/data/README.md#quality-of-derived-columns). SR in % with 95 % intervals over the test scenes, which do not cover "
         "differences between trainings; those of the differences from the simulator's dynamics are over world models. "
         "Share of the gain: (SR - SR of Only-RGB) / (SR with the simulator's dynamics - SR "
         "of Only-RGB). Policies of rows with 15 copies are also trained on the states of 15 augmented copies of every "
-        "demonstration. Measures are means over the world models that have been probed, and so are the rates in the "
-        f"figures of measures and in rank correlations: {_measured(results)}. Several sources are one recording with different noise, so that p is too small. Derived "
-        "columns have the verdict of `add_dynamics.py`, before any training, with the checks that failed. Written by "
+        "demonstration. Measures are both R^2 and the error after two seconds: means over the world models that were "
+        f"measured ({_measured(results)}), as are the rates in the figures of measures and in rank correlations. Several "
+        "sources are one recording with different noise, so that p is too small. A verdict names the checks that failed. Written by "
         "`recipes/paper/sources.py --write`.",
     ]
     written, repeated = [], find_repeated(results)
@@ -54,15 +57,15 @@ def write_source_page(results: Path, tasks: list[str], architecture: str = "glim
             continue
         parts += [f"## {task}", source_table(results, task), gap_table(results, task)]
         rows = [
-            [name, f"{row['rho']:.2f}", p_text(row["p"]), str(row["sources"])]
-            for name, row in rank_correlations(results, task).items()
+            [policy, MEASURES[measure][0], f"{row['rho']:.2f}", p_text(row["p"]), str(row["sources"])]
+            for (policy, measure), row in rank_correlations(results, task).items()
         ]
         for name, plot in (("sources", plot_sources), *([("measures", plot_measures)] if rows else [])):
             written.append(results / f"{get_task(task).name}_{name}.png")
             plot(results, task, written[-1])
             parts.append(f"![{name}]({written[-1].name})")
         if rows:
-            parts.append(join_table(["policy, measure", "rank correlation with SR", "p", "sources"], rows))
+            parts.append(join_table(["policy", "measure", "rank correlation with SR", "p", "sources"], rows))
     written.append(results / "data.png")
     plot_data(results, "balance_reaching", written[-1])
     parts += ["## Number of demonstrations", data_table(results, "balance_reaching"), "![data](data.png)"]

@@ -182,7 +182,7 @@ def data_table(results: Path, task: str) -> str:
     return join_table(["", *map(str, SIZES)], lines)
 
 
-def rank_correlations(results: Path, task: str) -> dict[str, dict[str, float]]:
+def rank_correlations(results: Path, task: str) -> dict[tuple[str, str], dict[str, float]]:
     """Return Spearman's rank correlation of each measure with SR, by policy, with its p and the number of sources.
 
     p is that of random pairings. There is no correlation of less than five sources.
@@ -194,7 +194,7 @@ def rank_correlations(results: Path, task: str) -> dict[str, dict[str, float]]:
             random = PermutationMethod(rng=np.random.default_rng(0))
             found = pearsonr(rankdata(values), rankdata(rates), method=random)
             numbers = {"rho": float(found.statistic), "p": float(found.pvalue), "sources": len(rates)}
-            correlations[f"{policy}, {name}"] = numbers
+            correlations[policy, name] = numbers
     return correlations
 
 
@@ -285,7 +285,7 @@ def plot_measures(results: Path, task: str, path: Path) -> None:
                 named = any(line.get_label() == kind for line in axis.lines)
                 color = f"C{list(KINDS).index(kind)}"
                 axis.plot(x, y, marker, ms=6, color=color, alpha=0.8, label=None if named else kind)
-            if found := correlations.get(f"{policy}, {measure}"):
+            if found := correlations.get((policy, measure)):
                 shape = {"o": "circles", "s": "squares"}[marker]
                 title.append(f"{policy} ({shape}): rank correlation {found['rho']:.2f}")
         axis.set_title("\n".join(title), fontsize=8)

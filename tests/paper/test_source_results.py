@@ -109,9 +109,9 @@ def test_rank_correlations_are_over_the_sources(tmp_path):
     found = rank_correlations(tmp_path, "balance_reaching")
     rho = {name: row["rho"] for name, row in found.items()}
     assert rho == {
-        "recurrent, probe_position": pytest.approx(1),
-        "recurrent, probe_velocity": pytest.approx(-1),
-        "recurrent, open_loop_mm": pytest.approx(-1),
+        ("recurrent", "probe_position"): pytest.approx(1),
+        ("recurrent", "probe_velocity"): pytest.approx(-1),
+        ("recurrent", "open_loop_mm"): pytest.approx(-1),
     }
 
 
