@@ -165,7 +165,7 @@ def describe(open_loop: dict, probes: dict, perception: dict, verdicts: dict, se
         for where, found in places.items():
             lines.append(
                 f"{name}, {where}: colour error on objects {found['object_error']:.3f}, chroma explained "
-                f"{found['chroma_explained']:.2f}, goal's colour explained {found['goal_explained']:.2f}, background error "
+                f"{found['chroma_explained']:.2f}, colour of the goal explained {found['goal_explained']:.2f}, background error "
                 f"{found['background_error']:.3f}, cart by a linear map "
                 f"{1000 * found['cart_error']:.1f} mm"
             )
