@@ -124,7 +124,11 @@ def main(config: Config) -> None:
 
 
 def check_config(config: Config) -> None:
-    """Raise ``ValueError`` for a missing dataset, an unknown method, or options that have no effect."""
+    """Raise ``ValueError`` for a missing dataset, an unknown method, a wrong size, or options that have no effect."""
+    import torch
+
+    from dynmap_rl.modules.world_model import ARCHITECTURES
+
     if not config.dataset:
         raise ValueError("--dataset must be a folder or a hub id; name the dataset to train on")
     if config.method not in ("decoupled", "joint"):
@@ -136,10 +140,8 @@ def check_config(config: Config) -> None:
             )
     if config.image_size < 8 or config.image_size % 8:
         raise ValueError(f"--image_size must be a multiple of 8, got {config.image_size}")
-    if config.image_size % 32 and config.world_model.architecture not in ("glimpse", "plain"):
-        raise ValueError(
-            f"--image_size must be a multiple of 32 with {config.world_model.architecture}, got {config.image_size}"
-        )
+    with torch.device("meta"):  # the encoder refuses sizes that it cannot have, before the videos are decoded
+        ARCHITECTURES[config.world_model.architecture][0](64, image_size=config.image_size)
 
     def own(settings: type, base: type) -> list[str]:
         return [field.name for field in fields(settings) if field.name not in {f.name for f in fields(base)}]

@@ -35,7 +35,7 @@ def compare_cells(cells: Mapping[Key, Cell]) -> list[dict]:
         the paper's gap; ``p`` (see :func:`dynmap_rl.evaluation.outcome_gap`); the 95 % interval of the gap over
         ``trainings`` (see :func:`gap_over_trainings`); the number of ``world_models`` of both sides; and ``verdict``.
         That is ``holds`` if p is below 0.05 and the interval over trainings is on the side that the claim says; ``does
-        not hold`` if p is and it is on the other side; else ``open``.
+        not hold`` if p is below 0.05 and that interval is on the other side; else ``open``.
     """
     return [
         _compare(pair, cells)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from functools import partial
 from pathlib import Path
 
 from dynmap_rl.envs.tasks import get_task
@@ -42,8 +43,8 @@ def write_source_page(results: Path, tasks: list[str], architecture: str = "glim
         "# Sources of dynamics, and numbers of demonstrations",
         f"World models have {FORMS[architecture]}. The rows are explained in [recipes/README.md](../../README.md"
         "#sources-of-dynamics), the verdicts of `add_dynamics.py` on derived columns, before any training, in "
-        "[dynmap_rl/data/README.md](../../../dynmap_rl/data/README.md#quality-of-derived-columns). SR in % with 95 % intervals over the test scenes, which do not cover "
-        "differences between trainings; those of the differences from the simulator's dynamics are over world models. "
+        "[dynmap_rl/data/README.md](../../../dynmap_rl/data/README.md#quality-of-derived-columns). SR in % with 95 % "
+        "intervals over the test scenes, which do not cover differences between trainings; those of the differences from the simulator's dynamics are over world models. "
         "Share of the gain: (SR - SR of Only-RGB) / (SR with the simulator's dynamics - SR "
         "of Only-RGB). Policies of rows with 15 copies are also trained on the states of 15 augmented copies of every "
         "demonstration. Measures are both R^2 and the error after two seconds: means over the world models that were "
@@ -56,11 +57,14 @@ def write_source_page(results: Path, tasks: list[str], architecture: str = "glim
         if not any(read_source(results, task, source, policy) for source in SOURCES for policy in POLICIES):
             continue
         parts += [f"## {task}", source_table(results, task), gap_table(results, task)]
+        correlations = rank_correlations(results, task)
         rows = [
             [policy, MEASURES[measure][0], f"{row['rho']:.2f}", p_text(row["p"]), str(row["sources"])]
-            for (policy, measure), row in rank_correlations(results, task).items()
+            for (policy, measure), row in correlations.items()
         ]
-        for name, plot in (("sources", plot_sources), *([("measures", plot_measures)] if rows else [])):
+        plots = {"sources": plot_sources}
+        plots |= {"measures": partial(plot_measures, correlations=correlations)} if rows else {}
+        for name, plot in plots.items():
             written.append(results / f"{get_task(task).name}_{name}.png")
             plot(results, task, written[-1])
             parts.append(f"![{name}]({written[-1].name})")

@@ -272,9 +272,8 @@ def plot_data(results: Path, task: str, path: Path) -> None:
     save_figure(figure, path)
 
 
-def plot_measures(results: Path, task: str, path: Path) -> None:
-    """Draw SR against each cheap measure, a colour for each kind of source, with the rank correlation."""
-    correlations = rank_correlations(results, task)
+def plot_measures(results: Path, task: str, path: Path, correlations: dict) -> None:
+    """Draw SR against each cheap measure, a colour for each kind of source, with :func:`rank_correlations`."""
     points = {policy: measured_points(results, task, policy) for policy in POLICIES}
     figure, axes = plt.subplots(1, len(MEASURES), figsize=(11, 4.6), sharey=True, layout="constrained")
     for axis, (measure, (text, _)) in zip(axes, MEASURES.items(), strict=True):

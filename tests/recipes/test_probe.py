@@ -29,6 +29,9 @@ def trained(recording, tmp_path_factory):
     six = {"low": [-1.0] * 6, "high": [1.0] * 6}
     save_world_model(folder / "robot" / "world_model", make_world_model(constants | {"action": six}, ()))
     write_json(folder / "robot" / "eval.json", {"world_model": {"training": "decoupled", "dataset": "robot"}})
+    save_world_model(folder / "foreign" / "world_model", make_world_model(constants, ()))
+    origin = {"training": "decoupled", "task": "absent:Task"}  # of a file, which must import nothing
+    write_json(folder / "foreign" / "eval.json", {"world_model": origin})
     return folder
 
 
@@ -63,6 +66,7 @@ def test_writes_errors_and_probes_of_every_world_model(trained, recording, tmp_p
     [
         (["--runs", "nothing"], "nothing"),
         (["--runs", "robot"], "must be of tasks 1 to 3, got robot"),
+        (["--runs", "foreign"], "must be of tasks 1 to 3, got foreign"),
         (["--runs", "none", "--test_episodes", "0"], "test_episodes"),
         (["--runs", "position", "--horizon", "200"], "120, got 20 + 200"),
     ],

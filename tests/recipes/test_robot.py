@@ -103,7 +103,7 @@ def test_a_dataset_without_dynamics_trains_on_its_frames_in_permuted_colours(dat
         ),
         (
             ["--dataset", "gliding", "--image_size", "72", "--world_model.architecture", "vit"],
-            "--image_size must be a multiple of 32 with vit",
+            "must be a multiple of 32, got 72",
         ),
         (
             [
