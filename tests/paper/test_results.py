@@ -4,6 +4,7 @@ import pytest
 from made_up import TASK, write
 from scipy.stats import t
 
+from dynmap_rl.evaluation.statistics import shared_interval
 from dynmap_rl.paper.results import count_commits, find_repeated, read_cells
 
 KEY = TASK, "decoupled", "recurrent", "RGB+[P]"
@@ -17,6 +18,7 @@ def test_a_cell_merges_the_runs_that_are_there(tmp_path):
     assert cell.rates() == [100.0, 75.0] and cell.summary["SR"] == 87.5
     assert cell.summary["episodes"] == 6 * 40
     assert cell.protocol["SR"] == (87.5, 12.5)
+    assert cell.summary["DR_interval"] == shared_interval(cell.policies, "dropped")
     low, high = cell.summary["SR_interval"]
     assert low < 87.5 < high
 
