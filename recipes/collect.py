@@ -13,7 +13,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynmap_rl.utils.cli import command_line, run_recipe
+from dynmap_rl.utils.cli import command_line, refuse, run_recipe
 
 
 @dataclass(frozen=True)
@@ -53,6 +53,8 @@ def main(config: Config) -> None:
 
     suffix = "" if config.kind == "demonstrations" else f"_{config.kind}"
     output = config.output or Path("datasets") / f"{get_task(config.task).name}{suffix}"
+    if config.launcher == "ray":
+        refuse(config, Config(), ["workers"], "--launcher ray")
     if config.push_to_hub:
         check_uploadable(config.task, get_task(config.task).layout)
     complete = (output / META).exists()

@@ -76,7 +76,7 @@ def main(config: Config) -> None:
     task, seeds = get_task(config.task), parse_seeds(config.seeds)
     device = choose_device(config.compute.device)
     check_logger(config.logger)
-    check_corrections(config.policy, config.task)
+    check_corrections(config.policy, config.task, seeds)
     check_copies(config.policy, config.task)
     if config.dataset:
         check_dataset(config.dataset, config.task)

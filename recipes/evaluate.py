@@ -73,7 +73,7 @@ def main(config: Config) -> None:
     else:
         of_frames = "delay", "jitter", "lost", "delay_error", "stale"
         refuse(config, Config(), ["seed", "trust_remote_code", *of_frames], "an expert")
-        refuse(config.compute, Compute(), ["device"], "an expert", "compute.")
+        refuse(config.compute, Compute(), ["device", "threads"], "an expert", "compute.")
     torch.set_num_threads(1)  # networks are small, and threads would wait for each other
     folder, text, result, draw = (judge_policy if config.policy else judge_expert)(config)
     print(text)
@@ -142,9 +142,12 @@ def load_policy(config: Config, folder: Path, task):
     if not folder.exists():
         raise ValueError(f"--policy must be a run or a policy, got {config.policy}; see recipes/README.md")
     if has_world_model(folder):
+        refuse(config, Config(), ["trust_remote_code"], "a run")
         return load_actor(folder, config.seed).to(choose_device(config.compute.device))
     path = Path(config.policy).expanduser()
-    if not path.exists() and not config.trust_remote_code:
+    if path.exists():
+        refuse(config, Config(), ["trust_remote_code"], "a policy on this machine")
+    elif not config.trust_remote_code:
         raise ValueError(
             f"{config.policy} on the hub may name code to run; add --trust_remote_code to allow it"
         )

@@ -67,7 +67,7 @@ def main(config: Config) -> None:
     task, seeds = get_task(config.task, kind=Task), parse_seeds(config.seeds)
     choose_device(config.compute.device)
     check_logger(config.logger)
-    check_corrections(config.policy, config.task)
+    check_corrections(config.policy, config.task, seeds)
     check_copies(config.policy, config.task)
     if config.dataset:
         check_dataset(config.dataset, config.task)

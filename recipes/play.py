@@ -165,6 +165,8 @@ def save_film(frames: list, path: Path, dt: float) -> None:
     import numpy as np
     from PIL import Image
 
+    from dynmap_rl.reporting.media import frame_durations
+
     images = [Image.fromarray(frame) for frame in frames[::2]]
     images = [image.resize((image.width // 2, image.height // 2)) for image in images]
     some = np.concatenate([np.asarray(image) for image in images[:: len(images) // 16 + 1]])
@@ -172,7 +174,8 @@ def save_film(frames: list, path: Path, dt: float) -> None:
     colors = Image.fromarray(some).quantize(128, Image.Quantize.FASTOCTREE)
     images = [image.quantize(palette=colors, dither=Image.Dither.NONE) for image in images]
     path.parent.mkdir(parents=True, exist_ok=True)
-    images[0].save(path, save_all=True, append_images=images[1:], duration=round(2000 * dt), loop=0)
+    durations = frame_durations(len(images), 2 * dt)
+    images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0)
     print(f"written: {path}")
 
 

@@ -61,7 +61,8 @@ def open_cached(
                     _build(entry, build)
                     for other in place.iterdir():
                         if other.is_dir() and other != entry:
-                            shutil.rmtree(other, ignore_errors=True)
+                            # A kill while it is deleted must not leave a part of it under its name.
+                            shutil.rmtree(other.rename(other.with_suffix(".tmp")), ignore_errors=True)
         return _map(entry)
     except OSError as error:
         if error.errno is None:

@@ -137,6 +137,15 @@ def choose_columns(root: Path, info: dict, layout: Layout) -> dict:
                 f"{name} of {root} must have the shape ({size},), got {shape}; train on other datasets with "
                 "recipes/robot.py"
             )
+    for quantity, names in layout.dynamics.items():
+        found = features.get(f"dynamics.{quantity}", {}).get("names")
+        if isinstance(found, list) and [n.rpartition("_")[2] for n in found] != [
+            n.rpartition("_")[2] for n in names
+        ]:  # augmentation takes entries for x, y and angles
+            raise ValueError(
+                f"dynamics.{quantity} of {root} must have entries such as {', '.join(names)}, got {', '.join(found)}; "
+                "train on other datasets with recipes/robot.py"
+            )
     return NEEDED | {key: name for key, name in OPTIONAL.items() if name in features}
 
 

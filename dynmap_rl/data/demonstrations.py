@@ -57,7 +57,8 @@ def load_dataset(dataset: str | Path, split: str | None = None, cache: Path | No
 
     Args:
         dataset: local folder, or id of a dataset on the Hugging Face hub (``user/name``).
-        split: ``train``, ``eval``, or another split that the dataset's ``info.json`` names.
+        split: ``train``, ``eval``, or another split that the dataset's ``info.json`` names. By default all episodes, by
+            their index, which are copied into memory where the training episodes are not the first ones.
         cache: folder for decoded datasets; by default ``DATASET.cache`` beside the dataset.
 
     Returns:

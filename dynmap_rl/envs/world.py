@@ -147,7 +147,10 @@ class World:
 
     def action_for(self, acceleration: np.ndarray) -> np.ndarray:
         """Return the position-update action that gives this acceleration of the cart in the next step."""
-        return self.action + np.asarray(acceleration, dtype=np.float64) * CONTROL_DT**2
+        acceleration = np.asarray(acceleration, dtype=np.float64)
+        if acceleration.shape != (3,):
+            raise ValueError(f"an acceleration must be 3 finite numbers, got {acceleration}")
+        return self.action + acceleration * CONTROL_DT**2
 
     def _locate_block(self) -> tuple[float, float, float]:
         cx, cy, ct, bx, by, bt = self.position.tolist()

@@ -41,10 +41,15 @@ def save_gif(pixels: torch.Tensor, path: Path, dt: float, columns: int = 4, scal
     size = columns * width * scale, rows * height * scale
     images = [Image.fromarray(f).convert("P", palette=Image.Palette.ADAPTIVE) for f in grid]  # small: quick
     images = [image.resize(size, Image.Resampling.NEAREST) for image in images]
-    ends = (100 * dt * every * np.arange(len(images) + 1)).round()  # a file counts in steps of 10 ms
-    durations = (10 * np.diff(ends)).tolist()
+    durations = frame_durations(len(images), every * dt)
     path.parent.mkdir(parents=True, exist_ok=True)
     images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0, optimize=True)
+
+
+def frame_durations(count: int, dt: float) -> list[float]:
+    """Return the durations (ms) of frames that are ``dt`` seconds apart, in a file that counts in steps of 10 ms."""
+    ends = (100 * dt * np.arange(count + 1)).round()
+    return (10 * np.diff(ends)).tolist()
 
 
 def film(

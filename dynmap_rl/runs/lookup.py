@@ -99,7 +99,8 @@ def load_world_model_of(run: str | Path) -> tuple[WorldModel, dict[str, str]]:
     """
     run = find_run(str(run))
     run = run.parent if run.name == "world_model" else run
-    top = run.parent if (run / "world_model").exists() and run.name.startswith("seed_") else run
+    of_seed = run.name.startswith("seed_") and not (run / "config.json").exists()
+    top = run.parent if of_seed and (run / "world_model").exists() else run
     source = read_json(top / "eval.json").get("world_model") if (top / "eval.json").exists() else None
     # The file may be from elsewhere, and folders are named after the training.
     known = isinstance(source, dict) and source.get("training") in TRAININGS

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from tensordict import TensorDict
@@ -11,7 +13,7 @@ from torchrl.envs.utils import step_mdp
 from tqdm import tqdm
 
 from dynmap_rl.data.features import compute_features
-from dynmap_rl.envs.scene import scene_seeds
+from dynmap_rl.envs.scene import SEEDS_PER_SPLIT, scene_seeds
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.envs.world import EPISODE_STEPS, limit_actions
 from dynmap_rl.experts.network import list_checkpoints, load_expert, task_of_expert
@@ -56,8 +58,8 @@ def collect_corrections(actor: TensorDictModuleBase, task: str, seeds: list[int]
     return torch.stack(steps, 1)
 
 
-def check_corrections(settings: PolicyTraining, task: str | None) -> None:
-    """Raise ``ValueError`` if a policy is to be corrected and there is no expert of the task that could."""
+def check_corrections(settings: PolicyTraining, task: str | None, seeds: Sequence[int] = ()) -> None:
+    """Raise ``ValueError`` if policies are to be corrected and there is no expert of the task, or no scene for a seed."""
     if not settings.corrections:
         if settings.correction_updates != PolicyTraining().correction_updates:
             raise ValueError(
@@ -67,6 +69,11 @@ def check_corrections(settings: PolicyTraining, task: str | None) -> None:
     if task is None:
         raise ValueError("PolicyTraining.corrections need the expert of a task, got no task")
     list_checkpoints(task)
+    largest = (SEEDS_PER_SPLIT - FIRST_SCENE) // settings.corrections - 1
+    if max(seeds, default=0) > largest:
+        raise ValueError(
+            f"--seeds must be at most {largest} with {settings.corrections} corrections, got {max(seeds)}"
+        )
 
 
 def add_corrections(

@@ -108,13 +108,13 @@ def check_start(dataset: str | Path, task: str) -> None:
     if (meta := find_meta(root)) is None:
         return
     info, rules = read_info(root), get_task(task)
+    columns = read_table(root, info, ["observation.state"])
     views = [iterate_frames(root, info, f"{CAMERAS}{camera}") for camera in rules.layout.cameras]
     first = [next(view) for view in views]
     seeds = {row["episode_index"]: row.get("scene_seed") for row in meta["episodes"]}
     if (seed := seeds.get(first[0][0])) is None:
         return
     world = rules.begin(seed)
-    columns = read_table(root, info, ["observation.state"])
     recorded = read_column(root, info, columns, "observation.state")[
         columns["episode_index"].to_numpy() == first[0][0]
     ]

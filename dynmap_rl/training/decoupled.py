@@ -97,7 +97,7 @@ def train_policies(
         OSError: a process died, or the disk is full.
     """
     settings, compute, folder = settings or PolicyTraining(), compute or Compute(), Path(folder)
-    check_corrections(settings, task)
+    check_corrections(settings, task, seeds)
     check_copies(settings, task)
     for path in (folder / f"seed_{seed}" / TRAINED for seed in seeds):
         if path.exists() and compare_settings(

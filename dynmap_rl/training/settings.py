@@ -73,7 +73,7 @@ class WorldModelTraining(WorldModelArchitecture):
         super().__post_init__()
         check_at_least(self, 1, "updates", "windows", "rgb_frames")
         check_at_least(self, 2, "window_steps")
-        check_at_least(self, 0, "learning_rate", "rarity", "beta_rgb", "beta_z", "beta_dynamics")
+        check_at_least(self, 0, "seed", "learning_rate", "rarity", "beta_rgb", "beta_z", "beta_dynamics")
         check_share(self, "short_windows", "imagined", "labelled")
         if not self.labelled:
             raise ValueError(

@@ -237,11 +237,11 @@ def parse_seeds(text: str) -> list[int]:
     """Parse seeds such as ``0,1,2``.
 
     Raises:
-        ValueError: an entry is no whole number, or occurs twice.
+        ValueError: an entry is no whole number of at least 0, or occurs twice.
     """
     seeds = parse_numbers(text, "--seeds")
-    if len(set(seeds)) < len(seeds):
-        raise ValueError(f"--seeds must be different numbers, got {text}")
+    if len(set(seeds)) < len(seeds) or min(seeds) < 0:
+        raise ValueError(f"--seeds must be different numbers of at least 0, got {text}")
     return seeds
 
 

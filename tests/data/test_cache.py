@@ -76,6 +76,25 @@ def test_a_changed_file_makes_the_cache_stale(copy, decoded):
     assert decoded == [copy, copy] and old not in list_entries(copy) and len(list_entries(copy)) == 1
 
 
+def test_a_kill_while_a_stale_entry_is_deleted_leaves_no_part_of_it(copy, monkeypatch):
+    load_dataset(copy)
+    (old,) = list_entries(copy)
+    rmtree = shutil.rmtree
+
+    def stop(path, **options):
+        if options.get("ignore_errors") and path.stem == old.name:
+            next(path.rglob("*.memmap")).unlink()
+            raise KeyboardInterrupt
+        return rmtree(path, **options)
+
+    change_info(copy, lambda info: info.update(robot_type="other"))
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "rmtree", stop)
+        with pytest.raises(KeyboardInterrupt):
+            load_dataset(copy)
+    assert not old.exists()
+
+
 def test_the_hash_of_a_dataset_is_that_of_its_videos_too(copy):
     before, video = hash_content(copy), copy / "videos/observation.images.top/chunk-000/file-000.mp4"
     video.parent.mkdir(parents=True)

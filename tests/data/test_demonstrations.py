@@ -267,6 +267,18 @@ def test_a_dataset_of_others_has_no_metadata_but_can_be_loaded(copy):
     assert not episodes["disturbed"].any()
 
 
+def test_points_are_not_taken_for_bodies(copy):
+    """Six numbers a step too, which augmentation would mirror as angles."""
+    (copy / "meta" / "dynmap.json").unlink()
+    points = [f"{body}_{axis}" for body in ("cart", "object1", "object2") for axis in "xy"]
+    for quantity in ("position", "velocity", "acceleration"):
+        change_info(
+            copy, lambda info, name=f"dynamics.{quantity}": info["features"][name].update(names=points)
+        )
+    with pytest.raises(ValueError, match="block_theta, got .*object2_y.*robot.py"):
+        load_demonstrations(copy)
+
+
 def test_demonstrations_are_both_splits_and_the_constants(recording, copy):
     episodes, constants = load_demonstrations(recording)
     for split in ("train", "eval"):

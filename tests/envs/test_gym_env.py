@@ -178,11 +178,13 @@ def test_unknown_argument_raises(name):
         DynmapEnv(**{name: "nope"})
 
 
-def test_invalid_action_raises():
-    env = make()
+@pytest.mark.parametrize("control", ["position", "acceleration"])
+@pytest.mark.parametrize("action", [[np.nan, 0, 0], 0.0, [0.0], [0.0, 0.0]])
+def test_invalid_action_raises(control, action):
+    env = make(control=control)
     env.reset(seed=0)
     with pytest.raises(ValueError, match="3 finite numbers"):
-        env.step(np.array([np.nan, 0, 0]))
+        env.step(np.array(action))
 
 
 def play_vector(env: gym.vector.VectorEnv, steps: int) -> list[np.ndarray]:

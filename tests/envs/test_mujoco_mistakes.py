@@ -80,7 +80,7 @@ def test_steps_that_say_nothing_of_success_and_unstable_ones_are_refused(own_tas
         task.step([world], [np.ones(1)])
     world.data.qpos[:] = np.nan
     monkeypatch.setattr(type(world.env), "step", lambda self, action: (0, 0, False, False, {}))
-    with pytest.raises(ValueError, match="not finite"):
+    with pytest.raises(ValueError, match="unstable in step 2"):
         task.step([world], [np.ones(1)])
 
 
@@ -140,6 +140,19 @@ def test_a_reset_must_set_all_that_the_physics_depend_on(own_task, monkeypatch):
     monkeypatch.setattr(kind, "reset", reset)
     with pytest.raises(ValueError, match="same seed and actions.*masses"):
         demonstrators._open_simulator.__wrapped__(own_task, kind)
+
+
+@pytest.mark.parametrize("after", [0, 3])
+def test_an_unstable_simulation_is_refused_where_mujoco_resets_its_data(own_task, after):  # noqa: F811
+    task = get_task(own_task)
+    world = task.begin(0)
+    for _ in range(after):
+        task.step([world], [np.zeros(1)])
+    world.data.qvel[:] = 1e12
+    with pytest.raises(ValueError, match=f"unstable in step {after + 1}"):
+        task.step([world], [np.zeros(1)])
+    world = task.begin(0, world=world)
+    task.step([world], [np.zeros(1)])
 
 
 def test_an_environment_that_resets_itself_is_refused(own_task):  # noqa: F811

@@ -50,3 +50,5 @@ def test_what_a_reset_does_not_know_is_refused():
         env.reset(options={"goal_x": 0.7})
     with pytest.raises(ValueError, match="integers"):
         env.reset(scene_seed=torch.tensor([0.5, 1.5]))
+    with pytest.raises(ValueError, match="scene_seed .*at least 0"):
+        env.reset(scene_seed=torch.tensor([0, -1]))

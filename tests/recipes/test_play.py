@@ -71,6 +71,14 @@ def test_still_parts_keep_their_colours_in_an_animation(tmp_path):
     assert np.abs(shown[0][2:6, 2:6] - still[8, 8]).max() < 30
 
 
+def test_an_animation_lasts_as_long_as_its_episode(tmp_path):
+    frames = list(np.random.default_rng(0).integers(0, 255, (80, 32, 32, 3), dtype=np.uint8))
+    save_film(frames, tmp_path / "film.gif", dt=1 / 80)
+    with Image.open(tmp_path / "film.gif") as film:
+        durations = [frame.info["duration"] for frame in ImageSequence.Iterator(film)]
+    assert sum(durations) == 1000
+
+
 def test_episodes_of_a_person_become_a_dataset(tmp_path, monkeypatch):
     """The expert acts in the place of the person."""
     monkeypatch.setattr(Session, "_person_action", Session._expert_action)

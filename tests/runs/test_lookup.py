@@ -38,6 +38,8 @@ def test_the_world_model_of_a_run_with_its_origin(run):
     assert source == same_source == {"task": OURS, "training": "decoupled"}
     with pytest.raises(ValueError, match="no finished run"):
         load_world_model_of(run / "seed_0")
+    named = run.rename(run.with_name("seed_7"))
+    assert load_world_model_of(named)[1] == source
 
 
 def test_the_world_model_of_one_seed_of_a_joint_run(run):

@@ -15,7 +15,7 @@ from dynmap_rl.modules.actor import Actor
 from dynmap_rl.modules.checkpoints import make_policy
 from dynmap_rl.runs.folder import read_metrics
 from dynmap_rl.training import PolicyTraining, train_policies
-from dynmap_rl.training.dagger import FIRST_SCENE, add_corrections, collect_corrections
+from dynmap_rl.training.dagger import FIRST_SCENE, add_corrections, check_corrections, collect_corrections
 
 
 class Replay(torch.nn.Module):
@@ -78,6 +78,12 @@ def test_corrections_join_the_states_and_steps_after_a_failure_are_left_out():
     assert failed.any() and torch.equal(both["disturbed"][-2:], failed)
     other = add_corrections(features, model, policy, "balance_reaching", scenes=2, seed=1)
     assert not torch.isin(other["goal"][-2:, 0, 0], both["goal"][-2:, 0, 0]).any()
+
+
+def test_seeds_without_scenes_are_refused_before_the_training():
+    check_corrections(PolicyTraining(corrections=100), "balance_reaching", [989_999])
+    with pytest.raises(ValueError, match="--seeds must be at most 989999"):
+        check_corrections(PolicyTraining(corrections=100), "balance_reaching", [0, 990_000])
 
 
 def test_training_goes_on_with_the_corrections(tmp_path):

@@ -71,6 +71,13 @@ def test_a_recording_begins_as_the_task_does_now(recording, tmp_path, monkeypatc
         check_start(recording, TASK)
 
 
+def test_a_recording_without_its_data_is_refused(recording, tmp_path):
+    root = shutil.copytree(recording, tmp_path / "recording")
+    shutil.rmtree(root / "data")
+    with pytest.raises(ValueError, match="recording must have"):
+        find_or_record(TASK, root)
+
+
 def test_a_run_keeps_a_hash_of_its_data(recording, tmp_path):
     root, run = shutil.copytree(recording, tmp_path / "demonstrations"), tmp_path / "run"
     for _ in range(2):

@@ -216,7 +216,7 @@ def test_options_without_effect_are_refused():
 
 def test_seeds():
     assert parse_seeds("0,12") == [0, 12]
-    for text in ("a", "", "1,1"):
+    for text in ("a", "", "1,1", "0,-1"):
         with pytest.raises(ValueError, match="--seeds"):
             parse_seeds(text)
 

@@ -7,7 +7,6 @@ leaves an incomplete folder behind when it is stopped.
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -96,8 +95,6 @@ def write_columns(
             _write_rows(file, target, table["index"].to_numpy(), values)
         elif relative.parts[:2] == ("meta", "episodes") and file.suffix == ".parquet":
             _write_episodes(file, target, dict(spans(table["episode_index"].to_numpy())), values)
-        elif relative.parts[0] == "videos":
-            _link(file, target)
         else:
             shutil.copy2(file, target)
     shape = [len(names)]
@@ -163,10 +160,3 @@ def compute_stats(numbers: np.ndarray) -> dict[str, np.ndarray]:
 
     # float32 is not enough for variances.
     return get_feature_stats(numbers.astype(np.float64), axis=0, keepdims=False)
-
-
-def _link(file: Path, target: Path) -> None:
-    try:
-        os.link(file.resolve(), target)
-    except OSError:
-        shutil.copy2(file, target)

@@ -60,6 +60,8 @@ def record_dataset(
     from filelock import FileLock, Timeout
 
     check_launcher(launcher)
+    if workers < 1:
+        raise ValueError(f"workers must be at least 1, got {workers}")
     root = Path(root).expanduser().absolute()
     settings = {"task": task, "kind": kind, "episodes": episodes, "eval_episodes": eval_episodes}
     settings |= {"expert": str(expert or task), "format": FORMAT}

@@ -22,7 +22,7 @@ class MetaWorldTask(MujocoTask):
 
     Action, within -1 to 1: x, y and z of the hand's target, 10 mm a step each, and the gripper's effort.
 
-    Success: in any step so far, the object was within 70 mm of the goal.
+    Success: the benchmark's own condition has held in any step so far.
 
     Attributes:
         environment: name of the environment in Meta-World.

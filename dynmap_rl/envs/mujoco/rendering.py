@@ -71,7 +71,7 @@ class FrameRenderer:
         model.vis.quality.shadowsize = model.vis.quality.offsamples = 0
         model.geom_rgba[list(hide), 3] = 0
         self.model, self.cameras = model, [camera.make() for camera in cameras]
-        _free_unused()
+        free_unused()
         self.canvas = make_canvas(size)
         self.canvas.make_current()
         self.context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50.value)
@@ -79,7 +79,7 @@ class FrameRenderer:
         # The garbage collector may come while another renderer draws, whose context must stay the current one.
         finalizer = weakref.finalize(self, UNUSED.append, (self.canvas, self.context))
         finalizer.atexit = False
-        atexit.register(_free_unused)
+        atexit.register(free_unused)
         atexit.register(finalizer)  # later than MuJoCo's own, and therefore called before
         drawn = 2 * (model.ngeom + model.nsite + model.ntendon)  # beyond maxgeom, MuJoCo leaves geoms out
         self.scene = mujoco.MjvScene(model, maxgeom=max(1000, drawn))
@@ -93,7 +93,7 @@ class FrameRenderer:
 
     def draw(self, data: mujoco.MjData) -> np.ndarray:
         """Draw the state of the model, uint8 ``[size, cameras * size, 3]``."""
-        _free_unused()
+        free_unused()
         self.canvas.make_current()
         frames = []
         for camera in self.cameras:
@@ -105,7 +105,7 @@ class FrameRenderer:
         return np.concatenate(frames, 1)
 
 
-def _free_unused() -> None:
+def free_unused() -> None:
     """Free the memory of renderers that are no longer used."""
     while UNUSED:
         canvas, context = UNUSED.pop()

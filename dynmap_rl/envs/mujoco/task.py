@@ -15,7 +15,7 @@ import numpy as np
 
 from ..protocol import BaseTask, Layout
 from .bodies import Body
-from .rendering import Camera, FrameRenderer, find_heavy, find_parts
+from .rendering import Camera, FrameRenderer, find_heavy, find_parts, free_unused
 from .world import MujocoWorld
 
 SIZES = 64, 96, 128
@@ -212,6 +212,7 @@ class MujocoTask(BaseTask):
     def close(self, world: MujocoWorld) -> None:
         world.env.close()
         world.renderer = None
+        free_unused()
 
     def distance(self, world: MujocoWorld) -> float:
         """Return the distance of the object to the goal (m)."""

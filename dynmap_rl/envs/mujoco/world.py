@@ -6,10 +6,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
+import mujoco
 import numpy as np
 
 from .bodies import Body, BodyReader
 from .rendering import FrameRenderer
+
+UNSTABLE = [getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}").value for name in ("QPOS", "QVEL", "QACC")]
 
 
 class MujocoWorld:
@@ -51,6 +54,7 @@ class MujocoWorld:
         self.steps, self.solved, self.dropped, self.touched = 0, False, False, set()
         self.position, self.velocity = self.reader.read(self.data)
         self.acceleration = np.zeros_like(self.velocity)
+        self.data.warning.number[UNSTABLE] = 0
 
     def step(self, action: np.ndarray) -> None:
         """Simulate one control step.
@@ -62,8 +66,11 @@ class MujocoWorld:
         self.observation, reward, _, _, self.info = self.env.step(action)
         self.reward, self.steps = float(reward), self.steps + 1
         self.position, self.velocity = self.reader.read(self.data)
-        if not (np.isfinite(self.position).all() and np.isfinite(self.velocity).all()):
-            raise ValueError(f"positions are not finite after {self.steps} steps: the simulation is unstable")
+        finite = np.isfinite(self.position).all() and np.isfinite(self.velocity).all()
+        if not finite or self.data.warning.number[UNSTABLE].any():  # MuJoCo may have reset its data meanwhile
+            raise ValueError(
+                f"the simulation is unstable in step {self.steps}: MuJoCo found numbers that are huge or not finite"
+            )
         if (elapsed := self.data.time - time) <= 0:
             raise ValueError(
                 f"the environment resets itself in step {self.steps}; leave out its own limit of steps, and Autoreset"
