@@ -73,7 +73,7 @@ def main(config: Config) -> None:
     else:
         of_frames = "delay", "jitter", "lost", "delay_error", "stale"
         refuse(config, Config(), ["seed", "trust_remote_code", *of_frames], "an expert")
-        refuse(config.compute, Compute(), ["device", "threads"], "an expert", "compute.")
+        refuse(config.compute, Compute(), ["device"], "an expert", "compute.")
     torch.set_num_threads(1)  # networks are small, and threads would wait for each other
     folder, text, result, draw = (judge_policy if config.policy else judge_expert)(config)
     print(text)
