@@ -107,6 +107,11 @@ def camera_columns(layout: Layout) -> list[str]:
     return [f"{CAMERAS}{camera}" for camera in layout.cameras]
 
 
+def entry_kinds(names: Sequence[str]) -> list[str]:
+    """Return what entries are, such as x, y and theta: augmentation changes each kind in its own way."""
+    return [name.rpartition("_")[2] for name in names]
+
+
 def choose_columns(root: Path, info: dict, layout: Layout) -> dict:
     """Return the columns to load, by key.
 
@@ -139,9 +144,7 @@ def choose_columns(root: Path, info: dict, layout: Layout) -> dict:
             )
     for quantity, names in layout.dynamics.items():
         found = features.get(f"dynamics.{quantity}", {}).get("names")
-        if isinstance(found, list) and [n.rpartition("_")[2] for n in found] != [
-            n.rpartition("_")[2] for n in names
-        ]:  # augmentation takes entries for x, y and angles
+        if isinstance(found, list) and entry_kinds(found) != entry_kinds(names):
             raise ValueError(
                 f"dynamics.{quantity} of {root} must have entries such as {', '.join(names)}, got {', '.join(found)}; "
                 "train on other datasets with recipes/robot.py"

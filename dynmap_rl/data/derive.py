@@ -17,6 +17,7 @@ from dynmap_rl.keys import DYNAMICS, FOUND
 
 from .angles import align_axes, align_turns
 from .camera import FrameSource, choose_view, read_motion
+from .decoding import entry_kinds
 from .demonstrations import DERIVED, META, find_layout, find_meta
 from .derivatives import check_method, differentiate, is_uniform
 from .format.columns import new_folder, write_columns
@@ -257,9 +258,8 @@ def _describe(
     meta: dict, planar: bool, names: list[str], values: dict[str, np.ndarray], rows: dict[int, slice]
 ) -> dict | None:
     """Return the metadata of a recording with other dynamics; None where the recipes of its task cannot read them."""
-    kinds = [name.rpartition("_")[2] for name in names]
-    if planar and kinds != np.resize(["x", "y", "theta"], len(names)).tolist():
-        return None  # augmentation takes entries for x, y and theta
+    if planar and entry_kinds(names) != np.resize(["x", "y", "theta"], len(names)).tolist():
+        return None
     train = np.concatenate([np.arange(rows[e].start, rows[e].stop) for e in range(*meta["splits"]["train"])])
     ranges = {q: planar_range(q, v[train]) if planar else value_range(v[train]) for q, v in values.items()}
     layout = dataclasses.replace(find_layout(meta), position=tuple(names), velocity=tuple(names))

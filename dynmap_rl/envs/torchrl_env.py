@@ -143,7 +143,7 @@ class DynmapBatchedEnv(EnvBase):
                 f"scene_seed must have shape ({n},), one seed for each world, got {shape}; "
                 "pass those of a ParallelEnv as list_of_kwargs"
             )
-        if seeds is not None and (torch.as_tensor(seeds).is_floating_point() or min(seeds) < 0):
+        if seeds is not None and ((given := torch.as_tensor(seeds)).is_floating_point() or (given < 0).any()):
             raise ValueError(f"scene_seed must be integers of at least 0, got {seeds}")
         rows = mask.nonzero().flatten().tolist()
         if len(rows) < n and None in self.worlds:

@@ -72,7 +72,7 @@ def check_corrections(settings: PolicyTraining, task: str | None, seeds: Sequenc
     largest = (SEEDS_PER_SPLIT - FIRST_SCENE) // settings.corrections - 1
     if max(seeds, default=0) > largest:
         raise ValueError(
-            f"--seeds must be at most {largest} with {settings.corrections} corrections, got {max(seeds)}"
+            f"seeds must be at most {largest} with {settings.corrections} corrections, got {max(seeds)}"
         )
 
 

@@ -108,7 +108,7 @@ def check_start(dataset: str | Path, task: str) -> None:
     if (meta := find_meta(root)) is None:
         return
     info, rules = read_info(root), get_task(task)
-    columns = read_table(root, info, ["observation.state"])
+    columns = read_table(root, info, ["observation.state"])  # refuses a recording without data files
     views = [iterate_frames(root, info, f"{CAMERAS}{camera}") for camera in rules.layout.cameras]
     first = [next(view) for view in views]
     seeds = {row["episode_index"]: row.get("scene_seed") for row in meta["episodes"]}

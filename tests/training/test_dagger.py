@@ -82,7 +82,7 @@ def test_corrections_join_the_states_and_steps_after_a_failure_are_left_out():
 
 def test_seeds_without_scenes_are_refused_before_the_training():
     check_corrections(PolicyTraining(corrections=100), "balance_reaching", [989_999])
-    with pytest.raises(ValueError, match="--seeds must be at most 989999"):
+    with pytest.raises(ValueError, match="seeds must be at most 989999"):
         check_corrections(PolicyTraining(corrections=100), "balance_reaching", [0, 990_000])
 
 
