@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 
@@ -183,8 +182,7 @@ def episode_rows(episodes: TensorDict, seeds: list[int]) -> list[dict]:
         Rows with ``scene_seed``, ``dropped``, ``touched`` (cart or block touched a wall of an obstacle or bin),
         ``position_error`` (m) and ``success``. If the world model decodes positions of all bodies,
         ``localization_error`` is the mean distance between predicted and true position of the first body, the cart or
-        the object of a MuJoCo task (m), and ``localization_error_away`` its mean over the steps more than 0.1 m from the
-        goal, where there are any.
+        the object of a MuJoCo task (m).
     """
     last = episodes["next"][:, -1]
     rows = [
@@ -203,12 +201,8 @@ def episode_rows(episodes: TensorDict, seeds: list[int]) -> list[dict]:
     if predicted is not None and predicted.shape == truth.shape and axes in (2, 3):
         error = predicted - truth
         error = error[:, 1:, :axes].norm(dim=-1)  # [E, T - 1]
-        away = (truth[..., :axes] - episodes["goal"])[:, 1:].norm(dim=-1) > 0.1
-        away_error = (error * away).sum(1) / away.sum(1)
-        for row, value, value_away in zip(rows, error.mean(1).tolist(), away_error.tolist(), strict=True):
+        for row, value in zip(rows, error.mean(1).tolist(), strict=True):
             row["localization_error"] = round(value, 5)
-            if math.isfinite(value_away):
-                row["localization_error_away"] = round(value_away, 5)
     return rows
 
 

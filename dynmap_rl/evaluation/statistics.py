@@ -11,6 +11,7 @@ from statistics import NormalDist
 import numpy as np
 
 FEW = 10  # successes or failures
+EQUAL = 1e-9  # rates (%) that differ by less are equal, but for rounding
 
 # SciPy is imported where it is used: it takes a second, also in every process of an evaluation.
 
@@ -24,8 +25,8 @@ def summarize(rows: list[dict]) -> dict:
     Returns:
         ``DR`` and ``SR`` (%) with 95 % Wilson intervals for independent episodes, ``PE`` (mm), the number of
         ``episodes`` and, where the rows have them, the share of episodes in which a wall was touched (``touched``, %),
-        the errors of the predicted cart position (``localization``, ``localization_away``, mm) and the number of failed
-        episodes by cause (``causes``, the most frequent first).
+        the error of the predicted position of the first body (``localization``, mm) and the number of failed episodes by
+        cause (``causes``, the most frequent first).
     """
     count = len(rows)
     dropped = sum(row["dropped"] for row in rows)
@@ -40,10 +41,8 @@ def summarize(rows: list[dict]) -> dict:
     }
     if "touched" in rows[0]:
         summary["touched"] = 100 * sum(row["touched"] for row in rows) / count
-    for name in ("localization", "localization_away"):
-        key = name.replace("localization", "localization_error")
-        if errors := [row[key] for row in rows if key in row]:
-            summary[name] = 1000 * float(np.mean(errors))
+    if errors := [row["localization_error"] for row in rows if "localization_error" in row]:
+        summary["localization"] = 1000 * float(np.mean(errors))
     if causes := Counter(row["cause"] for row in rows if "cause" in row):
         summary["causes"] = dict(causes.most_common())
     return summary
@@ -111,7 +110,7 @@ def student_interval(rates: Sequence[float]) -> tuple[float, float] | None:
     """
     from scipy.stats import ttest_1samp
 
-    if len(rates) < 2 or not np.ptp(rates):
+    if len(rates) < 2 or np.ptp(rates) < EQUAL:
         return None
     found = ttest_1samp(rates, 0).confidence_interval()
     return max(float(found.low), 0.0), min(float(found.high), 100.0)
@@ -129,7 +128,7 @@ def welch_interval(rates_a: Sequence[float], rates_b: Sequence[float]) -> tuple[
     """
     from scipy.stats import ttest_ind
 
-    if min(len(rates_a), len(rates_b)) < 2 or not (np.ptp(rates_a) or np.ptp(rates_b)):
+    if min(len(rates_a), len(rates_b)) < 2 or max(np.ptp(rates_a), np.ptp(rates_b)) < EQUAL:
         return None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # that one side does not vary
@@ -149,7 +148,7 @@ def paired_interval(rates_a: Sequence[float], rates_b: Sequence[float]) -> tuple
     """
     from scipy.stats import ttest_rel
 
-    if len(rates_a) < 2 or np.ptp(np.subtract(rates_a, rates_b)) < 1e-9:
+    if len(rates_a) < 2 or np.ptp(np.subtract(rates_a, rates_b)) < EQUAL:
         return None
     found = ttest_rel(rates_a, rates_b).confidence_interval()
     return float(found.low), float(found.high)
@@ -165,7 +164,7 @@ def outcome_gap(terms: Sequence[tuple[int, list[list[dict]]]], outcome: str = "s
 
     Returns:
         ``gap``, the sum of the means with their signs, in percentage points or mm; its 95 % ``interval`` over the start
-        states, after averaging over policy seeds; and ``p``, the two-sided probability of a gap of this size if the
+        states, after averaging over policy seeds, None if they do not differ; and ``p``, the two-sided probability of a gap of this size if the
         true gap is zero. Those of flags are by bootstrap, and exact over exchanges of the sign in every start state;
         those of ``position_error`` are by a t test.
 
@@ -189,7 +188,7 @@ def outcome_gap(terms: Sequence[tuple[int, list[list[dict]]]], outcome: str = "s
     difference = (100 if flags else 1000) * sums / unit
     gap = float(difference.mean())
     if not np.ptp(difference):
-        return {"gap": gap, "interval": (gap, gap), "p": exchange_p(sums) if flags else float(not gap)}
+        return {"gap": gap, "interval": None, "p": exchange_p(sums) if flags else float(not gap)}
     if flags:
         rng, p = np.random.default_rng(0), exchange_p(sums)
         interval = bootstrap((difference,), np.mean, batch=1000, rng=rng).confidence_interval

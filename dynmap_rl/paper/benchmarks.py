@@ -14,7 +14,7 @@ from dynmap_rl.reporting.media import choose_episodes
 from dynmap_rl.utils.files import read_json
 
 from .cells import Run
-from .results import count_devices
+from .results import count_devices, read_results
 from .tables import cause_table, commits_text, devices_text, gap_text, join_table
 
 TASKS = "FetchPush", "FetchSlide", "PlateSlide", "Soccer"
@@ -156,12 +156,11 @@ def derive_dataset(task: str, recording: Path, method: str, folder: Path) -> Non
 
 def read_benchmarks(results: Path) -> dict[tuple[str, str], list[dict]]:
     """Read the results by task and method, each a list of the seeds that are there."""
-    found = {}
-    for task, method, seed in list_benchmarks():
-        path = results / f"{name_run(task, method, seed)}.json"
-        if path.exists():
-            found.setdefault((task, method), []).append(read_json(path))
-    return found
+    cells = dict.fromkeys((task, method) for task, method, _ in list_benchmarks())
+    found = {
+        cell: read_results(results / f"{name_run(*cell, seed)}.json" for seed in SEEDS) for cell in cells
+    }
+    return {cell: seeds for cell, seeds in found.items() if seeds}
 
 
 def read_experts(results: Path) -> dict[str, dict]:
@@ -174,7 +173,7 @@ def benchmark_rows(results: Path) -> list[dict]:
     """Return a row for each task and method: SR, PE and DR over the seeds, intervals, and failures by cause.
 
     Returns:
-        Dicts with ``task``, ``method``, ``seeds``, ``episodes``, ``SR``, ``SR_interval``, ``DR``, ``DR_interval`` (%),
+        Dicts with ``task``, ``method``, ``seeds``, ``episodes``, ``SR``, ``SR_interval``, ``DR`` (%),
         ``PE`` (mm), ``localization`` (mm; None if the world model does not predict the object's position), ``rates`` (SR of
         each seed), ``causes`` (number of failed episodes by cause), ``commands``, ``commits`` and
         ``devices``. Intervals count with start states that the seeds share.
@@ -185,8 +184,6 @@ def benchmark_rows(results: Path) -> list[dict]:
     table = []
     for (task, method), cells in read_benchmarks(results).items():
         rows = [part for cell in cells for part in result_rows(cell)]
-        if len({tuple(row["scene_seed"] for row in part) for part in rows}) > 1:
-            raise ValueError(f"{results} must have the same scenes for all seeds of {method} on {task}")
         summary = summarize([row for part in rows for row in part])
         errors = [] if method in DERIVED else _localization(cells)  # of other entries, or in pixels
         table.append(
@@ -196,7 +193,6 @@ def benchmark_rows(results: Path) -> list[dict]:
                 "seeds": len(rows),
                 **{name: summary[name] for name in ("episodes", "SR", "DR", "PE")},
                 "SR_interval": shared_interval(rows),
-                "DR_interval": shared_interval(rows, "dropped"),
                 "localization": fmean(errors) if errors else None,
                 "rates": [summarize(part)["SR"] for part in rows],
                 "causes": summary.get("causes", {}),

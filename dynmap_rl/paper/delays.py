@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from itertools import cycle
 from pathlib import Path
 
 from dynmap_rl.envs.delay import FrameDelay
@@ -13,8 +14,9 @@ from dynmap_rl.modules.world_model import WorldModel
 from dynmap_rl.reporting.figures import plt, save_figure
 from dynmap_rl.utils.files import read_json
 
-from .results import ROWS
-from .tables import join_table
+from .past_actions import LONGEST
+from .results import ROWS, count_devices
+from .tables import commits_text, devices_text, join_table
 
 DELAYS = 0, 2, 4, 6, 10, 16, 24, 30  # control steps
 CONDITIONS = {  # name: text, settings of the frames besides the delay, whether pushed, and whether stale
@@ -34,7 +36,9 @@ CONDITIONS = {  # name: text, settings of the frames besides the delay, whether 
 
 
 def frame_delay(condition: str, steps: int) -> FrameDelay | None:
-    """Return how frames arrive under a condition; None where the condition is impossible with so short a delay."""
+    """Return how frames arrive under a condition; None where the delay is too short or too long for it."""
+    if condition == "past_actions" and steps > LONGEST:
+        return None
     try:
         return FrameDelay(steps, **CONDITIONS[condition][1])
     except ValueError:
@@ -104,7 +108,9 @@ def delay_page(results: list[dict]) -> str:
     """Return the page of the results: what was measured, the table, and the commands."""
     sizes = sorted({(result["split"], result["episodes"]) for result in results})
     scenes = ", ".join(f"{count} scenes of the split {split}" for split, count in sizes)
-    commands = sorted({cell["command"] for result in results for cell in result["cells"].values()})
+    cells = [cell for result in results for cell in result["cells"].values()]
+    commands = sorted({cell["command"] for cell in cells})
+    commits = commits_text(Counter(str(cell.get("commit")) for cell in cells))
     trained = {_run(result): result["trained"].get("command") for result in results}
     runs = [
         f"{i}. `{run}`: " + (f"`{trained[run]}`" if trained[run] else "ships with the package")
@@ -130,7 +136,7 @@ def delay_page(results: list[dict]) -> str:
             "",
             *runs,
             "",
-            "Commands of the measurements:",
+            f"Entries of the table by commit: {commits}.{devices_text(count_devices(cells))} Commands of the measurements:",
             "",
             "```bash",
             *commands,
@@ -253,7 +259,7 @@ def _draw_lines(axis, lines: list[dict]) -> None:
 
 def _draw_dots(axis, title: str, dots: dict[str, dict[str, dict]]) -> None:
     names, markers = list(dots), sorted({name for cells in dots.values() for name in cells}, key=_order)
-    for shape, (index, label) in zip("os^Dv<>P", enumerate(markers), strict=False):
+    for shape, (index, label) in zip(cycle("os^Dv<>P"), enumerate(markers), strict=False):
         shift = 0.15 * (index - (len(markers) - 1) / 2)
         found = [(place + shift, cells[label]) for place, cells in enumerate(dots.values()) if label in cells]
         places, cells = zip(*found, strict=True)

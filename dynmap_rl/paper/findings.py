@@ -6,6 +6,7 @@ only where the gap is larger than both differences could explain.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -15,7 +16,7 @@ from dynmap_rl.evaluation.statistics import outcome_gap, paired_interval, welch_
 from .cells import TASKS, Key
 from .claims import Pair, list_pairs
 from .results import ROWS, Cell
-from .tables import join_table, p_text
+from .tables import join_table, p_text, scene_gap_text
 
 HOLDS, FAILED, OPEN = VERDICTS = "holds", "does not hold", "open"
 MIXED = "mixed"
@@ -92,16 +93,20 @@ def _compare(pair: Pair, cells: Mapping[Key, Cell]) -> dict:
     }
 
 
-def judge_claim(comparisons: list[dict]) -> str:
+def judge_claim(comparisons: list[dict], count: int) -> str:
     """Return the verdict on a claim.
 
     ``holds`` if all of its comparisons hold; ``does not hold`` if some do not and none holds; ``mixed`` if some hold and
     some do not; else ``open``.
+
+    Args:
+        comparisons: those of the claim that have results.
+        count: number of the claim's comparisons.
     """
     verdicts = {row["verdict"] for row in comparisons}
     if FAILED in verdicts:
         return MIXED if HOLDS in verdicts else FAILED
-    return HOLDS if verdicts == {HOLDS} else OPEN
+    return HOLDS if verdicts == {HOLDS} and len(comparisons) == count else OPEN
 
 
 def markdown_claims(comparisons: list[dict]) -> str:
@@ -112,7 +117,7 @@ def markdown_claims(comparisons: list[dict]) -> str:
     """
     lines, verdicts, missing, pairs = [], [], {}, list_pairs()
     claims = list(dict.fromkeys(pair.claim for pair in pairs))
-    parts = dict.fromkeys((pair.claim, pair.group, pair.metric) for pair in pairs)
+    parts = Counter((pair.claim, pair.group, pair.metric) for pair in pairs)
     for part in sorted(parts, key=lambda part: claims.index(part[0])):
         own = [row for row in comparisons if (row["claim"], row["group"], row["metric"]) == part]
         if not own:
@@ -121,8 +126,9 @@ def markdown_claims(comparisons: list[dict]) -> str:
         counts = [str(sum(row["verdict"] == verdict for row in own)) for verdict in VERDICTS]
         unit = METRICS[part[2]][1].replace("%", "points")
         gaps = [_span([row["paper"] for row in own], 0), f"{_span([row['gap'] for row in own], 1)} {unit}"]
-        verdicts.append(judge_claim(own))
-        lines.append([*part, *gaps, *counts, f"**{verdicts[-1]}**"])
+        verdicts.append(judge_claim(own, parts[part]))
+        some = f" ({len(own)} of {parts[part]} have runs)" if len(own) < parts[part] else ""
+        lines.append([part[0], part[1] + some, part[2], *gaps, *counts, f"**{verdicts[-1]}**"])
     head = ["claim", "comparisons", "metric", "the paper's gaps", "gaps", *VERDICTS, "verdict"]
     rest = "".join(f"\n- {claim}: {'; '.join(groups)}" for claim, groups in missing.items())
     count = ", ".join(f"{name}: {verdicts.count(name)}" for name in (HOLDS, FAILED, MIXED, OPEN))
@@ -161,12 +167,11 @@ def markdown_comparisons(comparisons: list[dict]) -> str:
 
 
 def _comparison_row(row: dict) -> list[str]:
-    low, high = (round(end, 1) + 0.0 for end in row["interval"])  # no -0.0
     return [
         f"{row['group']}: {row['comparison']}",
         f"{row['metric']} {METRICS[row['metric']][1]}",
         ", ".join(f"{value:.1f}" for value in row["values"]),
-        f"{round(row['gap'], 1) + 0.0:+.1f} [{low:.1f}, {high:.1f}]",
+        scene_gap_text(row),
         p_text(row["p"]),
         "[{:.1f}, {:.1f}]".format(*row["trainings"]) if row["trainings"] else "-",
         ", ".join(map(str, row["world_models"])),

@@ -256,9 +256,9 @@ def _repeated(folder: Path) -> str:
         return ""
     lines = "\n".join(names)
     return (
-        f"The world models of {len(names)} runs were trained again later. The policies of these runs are on the earlier "
-        "training, and are not paired with policies on the later one.\n\n"
-        f"<details><summary>Runs on earlier world models</summary>\n\n{lines}\n\n</details>"
+        f"The world models of {len(names)} runs were trained twice. The policies of these runs are on another training than "
+        "that whose result has the world model's name, and are not paired with policies on that one.\n\n"
+        f"<details><summary>Runs on another training</summary>\n\n{lines}\n\n</details>"
     )
 
 

@@ -26,6 +26,8 @@ from dynmap_rl.training.loop import make_optimizer, set_learning_rate, step
 from dynmap_rl.training.settings import PolicyTraining
 from dynmap_rl.utils.devices import seed_everything
 
+LONGEST = 30  # steps; longest delay of the policy
+
 
 class PastActionsPolicy(nn.Module):
     """MLP policy ``a_t = pi(z_k, h_k, g, a_{k-1}, ..., a_{t-1}, t - k)`` on the state of the step k of the newest frame.
@@ -48,7 +50,7 @@ class PastActionsPolicy(nn.Module):
         hidden_size: int,
         action: Normalizer,
         goal: Normalizer,
-        max_delay: int = 30,
+        max_delay: int = LONGEST,
         width: int = 256,
     ):
         super().__init__()

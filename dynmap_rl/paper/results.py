@@ -128,8 +128,28 @@ def read_cells(results: Path, tables: Iterable[str] = tuple(COLUMNS)) -> dict[Ke
 
 
 def _read_cell(results: Path, key: Key, runs: list[Run]) -> Cell:
-    paths = [path for run in runs if (path := results / f"{run.name}.json").exists()]
-    return Cell(key, runs[0].table, tuple(map(read_json, paths)), len(runs) - len(paths))
+    found = read_results([results / f"{run.name}.json" for run in runs])
+    return Cell(key, runs[0].table, tuple(found), len(runs) - len(found))
+
+
+def read_results(paths: Iterable[Path]) -> list[dict]:
+    """Read those results that are there; they must be on the same start states.
+
+    Raises:
+        ValueError: two are on others.
+    """
+    found = {path: read_json(path) for path in paths if path.exists()}
+    first = None  # result, and its scenes, which follow each other
+    for path, result in found.items():
+        for seed in result["results"]:
+            rows = seed["test"]["rows"]
+            scenes = rows["first_scene_seed"], len(rows["success"])
+            first = first or (path, scenes)
+            if scenes != first[1]:
+                raise ValueError(
+                    f"{path} must have the same scenes as {first[0]}; evaluate it again or remove it"
+                )
+    return list(found.values())
 
 
 def find_repeated(folder: Path) -> list[str]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.utils.files import read_json, write_bytes
 
+from .results import count_devices
 from .source_results import (
     MEASURES,
     data_table,
@@ -22,7 +23,7 @@ from .source_results import (
     source_table,
 )
 from .sources import POLICIES, SOURCES
-from .tables import commits_text, join_table, p_text
+from .tables import commits_text, devices_text, join_table, p_text
 
 REPEATED = (
     "The world models of these runs were trained again between their recurrent and their feed-forward policies, and only the "
@@ -83,7 +84,7 @@ def write_source_page(results: Path, tasks: list[str], architecture: str = "glim
     parts += [
         "## Commands",
         f"`python recipes/paper/sources.py{form} --tasks TASK --only SOURCE` also derives the dataset of a source. "
-        f"Runs by commit: {commits}.",
+        f"Runs by commit: {commits}.{devices_text(count_devices(found))}",
         "\n".join(["```bash", *commands, "```"]),
     ]
     written.append(results / "README.md")

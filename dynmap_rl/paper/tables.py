@@ -105,7 +105,7 @@ def markdown_own(cells: Mapping[Key, Cell], table: str) -> str:
         for c in [cell] if ablations or not default else [default, cell]:
             name = str(1 + TASKS.index(c.key[0])) if ablations else c.key[2]
             lines.append([c.row, name, *_numbers(c, numbers), _difference(c, default)])
-    head = ["", "task" if ablations else "policy", *_head(numbers), "SR minus the default's [scenes]"]
+    head = ["", "task" if ablations else "policy", *_head(numbers), "SR minus the default's [scenes], p"]
     return f"{join_table(head, lines)}\n\n{_notes(own)}"
 
 
@@ -176,13 +176,13 @@ def _brackets(interval: tuple[float, float]) -> str:
 
 
 def _difference(cell: Cell, default: Cell | None) -> str:
-    """Return the difference of two success rates in points, with its interval over the scenes."""
+    """Return the difference of two success rates in points, with its interval over the scenes, and p."""
     if cell is default:
         return ""
     if default is None or not (cell.results and default.results):
         return "-"
     found = outcome_gap([(1, cell.policies), (-1, default.policies)])
-    return f"{found['gap']:+.1f} {_brackets(found['interval'])}"
+    return f"{scene_gap_text(found)}, {p_text(found['p'])}"
 
 
 def _short(numbers: dict, others: list[str]) -> str:
@@ -209,6 +209,15 @@ def cause_table(rows: Iterable[tuple[str, int, Mapping[str, int]]]) -> str:
         for title, episodes, counts in rows
     ]
     return join_table(["% of the episodes", "fail", *causes], lines)
+
+
+def scene_gap_text(gap: Mapping) -> str:
+    """Return a result of :func:`dynmap_rl.evaluation.outcome_gap` with its interval over the scenes, if it has one."""
+    text = f"{round(gap['gap'], 1) + 0.0:+.1f}"  # no -0.0
+    if gap["interval"] is None:
+        return text
+    low, high = (round(end, 1) + 0.0 for end in gap["interval"])
+    return f"{text} [{low:.1f}, {high:.1f}]"
 
 
 def gap_text(ours: Sequence[float] | None, theirs: Sequence[float] | None) -> str:

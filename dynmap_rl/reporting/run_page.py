@@ -144,12 +144,10 @@ def _has_entries_of_its_task(dataset: str | Path, task: str) -> bool:
 
 
 def _localization(results: list[dict]) -> dict[str, float]:
-    """Return the mean over the seeds of the world model's errors in the cart's position (mm)."""
+    """Return the mean over the seeds of the error in the first body's position (mm), where it is predicted."""
     summaries = [result["test"]["summary"] for result in results]
-    found = {
-        name: [s[name] for s in summaries if name in s] for name in ("localization", "localization_away")
-    }
-    return {name: float(np.mean(values)) for name, values in found.items() if values}
+    errors = [summary["localization"] for summary in summaries if "localization" in summary]
+    return {"localization": float(np.mean(errors))} if errors else {}
 
 
 def _draw(folder: Path, world_model: WorldModel, episodes: TensorDictBase, result: dict) -> None:

@@ -21,6 +21,7 @@ from pathlib import Path
 
 from .graphics import check_mujoco_gl
 from .settings import flatten, parse_numbers
+from .version import find_commit
 
 HINTS = {
     **dict.fromkeys(
@@ -55,6 +56,7 @@ def run_recipe(
     try:
         settings = parse_settings(config_class, read_arguments(given, config_class))
         check_mujoco_gl()  # before TorchRL is imported
+        find_commit()  # results name the commit of the start
         main(settings)
     except KeyboardInterrupt:
         sys.exit(f"stopped; {stopped}")

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import subprocess
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 
 
+@cache
 def find_commit(root: Path = ROOT) -> str | None:
     """Return the commit of a checkout, with ``-dirty`` where Python files differ from it; None outside of a checkout.
+
+    A process asks once: a commit that is made while a recipe runs is not that of its code.
 
     Args:
         root: top folder of the checkout, by default the one that this package is imported from.

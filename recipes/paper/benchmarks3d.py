@@ -11,7 +11,6 @@ datasets/TASK_hand, _tracks and _color. The page has success, failures by cause,
 uv pip install -e '.[lerobot,mujoco]'.
 """
 
-import json
 import sys
 from dataclasses import dataclass
 from functools import partial
@@ -41,7 +40,7 @@ class Config:
     presets: Path | None = None
     # List the runs and stop.
     dry_run: bool = False
-    # Write README.md and table.json in the folder of the results from the results alone, and stop.
+    # Write README.md in the folder of the results from the results alone, and stop.
     write: bool = False
 
     def __post_init__(self):
@@ -66,7 +65,7 @@ def main(config: Config) -> None:
     for path in (config.results / f"{run.name}.json" for run in runs if run not in todo):
         if (scenes := read_json(path)["test_protocol"]["episodes"]) != config.episodes:
             raise ValueError(
-                f"{path} has {scenes} --episodes instead of {config.episodes}; choose another --results"
+                f"{path} has {scenes} --episodes instead of {config.episodes}; choose another --results and --runs"
             )
     if config.dry_run:
         return print_runs(runs, todo)
@@ -83,7 +82,7 @@ def main(config: Config) -> None:
     )  # fmt: skip
     failed = launch(todo, start, workers=config.workers)
     copy_quality(runs, config.results)
-    copy_pictures(runs, config)
+    copy_pictures([run for run in todo if is_done(run.name, config.results)], config)
     if len(failed) < len(runs):  # something is there to write
         write(config)
     if failed:
@@ -92,7 +91,7 @@ def main(config: Config) -> None:
 
 
 def write(config: Config) -> None:
-    """Write ``README.md`` and ``table.json`` from the results, and print the table."""
+    """Write ``README.md`` from the results, and print the table."""
     from dynmap_rl.paper.benchmarks import benchmark_page, benchmark_rows, benchmark_table, read_experts
     from dynmap_rl.utils.files import write_bytes
 
@@ -100,9 +99,8 @@ def write(config: Config) -> None:
     if not rows:
         raise ValueError(f"{config.results} must have results; run recipes/paper/benchmarks3d.py first")
     write_bytes(config.results / "README.md", benchmark_page(rows, config.results).encode())
-    write_bytes(config.results / "table.json", json.dumps(rows, indent=1).encode())
     print(benchmark_table(rows, read_experts(config.results)))
-    print(f"written: {config.results / 'README.md'}, {config.results / 'table.json'}")
+    print(f"written: {config.results / 'README.md'}")
 
 
 def copy_pictures(runs: list, config: Config) -> None:

@@ -1,16 +1,15 @@
 """Measure success against the delay of the frames, and draw the figure and the table.
 
     python recipes/paper/delays.py --dry_run
-    python recipes/paper/delays.py --runs balance_reaching --eval.episodes 100
+    python recipes/paper/delays.py --runs balance_reaching --eval.episodes 100 --results runs/delays
     python recipes/paper/delays.py --runs runs/tables/A,runs/tables/B --conditions stale,imagined
     python recipes/paper/delays.py --write        # figure and table from the results alone
 
 Each run is evaluated under each condition: on stale frames; with the world model rolled forward; with a delay that is
 reported wrongly; with jitter, lost frames, and pushes that the policy is not told; and, in the place of its policy, with
 a feed-forward policy that is trained to act on an old state of the run's world model and the actions since. A run and a
-condition have one JSON file, with an entry for each delay, written after every one; entries that are there are skipped,
-so that the same command resumes a stopped grid. A LeRobot policy, such as ACT, is evaluated with chunks from which the
-actions of the delay are cut; train one with the command in dynmap_rl/integrations/lerobot/README.md.
+condition have one JSON file with an entry for each delay. The same command resumes a stopped grid. Of a policy of
+LeRobot, such as ACT of recipes/baseline.py, the actions of the delay are cut from its chunks.
 """
 
 import sys
@@ -42,13 +41,11 @@ class Config:
     conditions: str = ""
     # Delays in control steps, with commas between; by default 0 to 30.
     delays: str = ""
-    # Folder of the results.
+    # Folder of the results, and of the figures, which those of the repository have in media.
     results: Path = RESULTS / "delays"
-    # File of the figure.
-    figure: Path = RESULTS / "media/delays.png"
     # List the measurements and stop.
     dry_run: bool = False
-    # Draw the figure and write the table, README.md in the folder of the results, from the results alone.
+    # Draw the figures and write the table, README.md in the folder of the results, from the results alone.
     write: bool = False
     # Training of the policy with past actions.
     policy: PolicyTraining = PolicyTraining(kind="feedforward")
@@ -118,10 +115,8 @@ def open_result(config: Config, run: str, condition: str) -> tuple[Path, dict]:
         result["training"] = asdict(PolicyTraining()) | result["training"]
     facts |= trained if has_world_model(folder) else {}
     if other := [key for key, value in facts.items() if result.get(key) != value]:
-        raise ValueError(
-            f"{path} has another {', '.join(other).replace('trained', 'training of the run')}; choose another --results "
-            "or remove the file"
-        )
+        names = ", ".join(other).replace("trained", "training of the run")
+        raise ValueError(f"{path} has another {names}; choose another --results or remove the file")
     return path, result
 
 
@@ -130,44 +125,51 @@ def evaluate_cell(config: Config, path: Path, result: dict, steps: int) -> None:
     from dynmap_rl.evaluation.protocol import evaluate
     from dynmap_rl.paper.delays import CONDITIONS, frame_delay
     from dynmap_rl.runs.lookup import find_run, has_world_model
+    from dynmap_rl.utils.devices import device_name
     from dynmap_rl.utils.files import read_json, write_json
     from dynmap_rl.utils.version import find_commit
 
     _, _, pushed, stale = CONDITIONS[result["condition"]]
     delay = frame_delay(result["condition"], steps)
-    actor, names = load_actor(config, result, None if stale else delay)
+    actor, facts = load_actor(config, result, None if stale else delay)
+    if result["cells"] and result.get("weights_sha256", facts["weights_sha256"]) != facts["weights_sha256"]:
+        raise ValueError(f"{path} is of other weights; choose another --results or remove the file")
     workers = config.compute.threads if has_world_model(find_run(result["run"])) else 1
     found = evaluate(actor, result["task"], config.eval, delay, pushed, workers)["test"]
     cell = {name: found["summary"][name] for name in ("SR", "SR_interval", "DR", "DR_interval", "PE")}
     cell |= {"success": found["rows"]["success"], "command": command_line(sys.argv), "commit": find_commit()}
+    cell |= {"device": device_name(config.compute.device)}
     if path.exists():  # another process may have added cells
         result["cells"] |= read_json(path)["cells"]
     result["cells"][str(steps)] = cell
-    write_json(path, result | names)
+    write_json(path, result | facts)
     print(f"    SR {cell['SR']:.1f} %   DR {cell['DR']:.1f} %   PE {cell['PE']:.1f} mm", flush=True)
 
 
 def load_actor(config: Config, result: dict, delay) -> tuple:
-    """Return the actor of a result, which bridges a delay where one is given, and the names of its row and policy."""
+    """Return the actor of a result, which bridges a delay where one is given, and the names of its row, policy and weights."""
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.modules.delayed_actor import DelayedActor
     from dynmap_rl.paper.delays import name_row
     from dynmap_rl.runs.lookup import find_run, has_world_model, load_actor
     from dynmap_rl.training.dataset import find_or_record
     from dynmap_rl.utils.devices import choose_device
+    from dynmap_rl.utils.weights import fingerprint
 
     folder, device = find_run(result["run"]), choose_device(config.compute.device)
     if not has_world_model(folder):
         from dynmap_rl.integrations.lerobot import LeRobotActor
 
         actor = LeRobotActor(folder, device, get_task(result["task"]), cut=delay is not None)
-        return actor, {"row": actor.policy.config.type, "policy": "LeRobot"}
+        weights = fingerprint(actor.policy)
+        return actor, {"row": actor.policy.config.type, "policy": "LeRobot", "weights_sha256": weights}
     actor = load_actor(folder, config.seed).to(device)
-    names = {"row": name_row(folder, actor.world_model), "policy": actor.policy.kind}
+    facts = {"row": name_row(folder, actor.world_model), "policy": actor.policy.kind}
+    facts |= {"weights_sha256": fingerprint(actor)}
     if result["condition"] == "past_actions":
-        names["policy"], dataset = "feedforward", find_or_record(result["task"], config.dataset)
-        return train_past_actions(folder, dataset, config.policy, config.seed), names
-    return (DelayedActor(actor, max_delay=delay.longest) if delay else actor), names
+        facts["policy"], dataset = "feedforward", find_or_record(result["task"], config.dataset)
+        return train_past_actions(folder, dataset, config.policy, config.seed), facts
+    return (DelayedActor(actor, max_delay=delay.longest) if delay else actor), facts
 
 
 @cache
@@ -185,15 +187,13 @@ def write(config: Config) -> None:
     from dynmap_rl.paper.delays import delay_page, plot_conditions, plot_delays, read_delays
     from dynmap_rl.utils.files import write_bytes
 
-    results = read_delays(config.results)
-    if not results:
+    if not (results := read_delays(config.results)):
         raise ValueError(f"{config.results} must have results; run recipes/paper/delays.py first")
-    page = config.results / "README.md"
-    conditions = config.figure.with_stem(f"{config.figure.stem}_conditions")
-    plot_delays(results, config.figure)
-    plot_conditions(results, conditions)
-    write_bytes(page, delay_page(results).encode())
-    print(f"written: {page}, {config.figure}, {conditions}")
+    media = RESULTS / "media" if config.results == RESULTS / "delays" else config.results
+    plot_delays(results, media / "delays.png")
+    plot_conditions(results, media / "delays_conditions.png")
+    write_bytes(config.results / "README.md", delay_page(results).encode())
+    print(f"written: {config.results}/README.md; delays.png and delays_conditions.png in {media}")
 
 
 if __name__ == "__main__":

@@ -124,6 +124,8 @@ def choose_runs(config: Config) -> list:
     runs += list_source_runs(tasks, config.datasets, only, seeds, form) if config.part != "data" else []
     runs += list_data_runs(config.datasets, only, seeds, form) if config.part != "table" else []
     unique = {run.name: run for run in runs}
+    if not unique:
+        raise ValueError(f"--part {config.part} has no runs of --only {config.only}; see --dry_run")
     return sorted(unique.values(), key=lambda run: run.needs is not None)
 
 

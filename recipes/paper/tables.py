@@ -84,7 +84,7 @@ def main(config: Config) -> None:
         return print_runs([run for run in list_runs() if run in chosen or run in todo], todo)
     if not todo:
         print(
-            f"nothing to do: {len(chosen)} runs are in {config.results}; choose another --results for a new grid"
+            f"nothing to do: {len(chosen)} runs are in {config.results}; choose another --results and --runs for a new grid"
         )
         return write_page(config)
     check_launcher(config.launcher)  # recording takes minutes

@@ -112,6 +112,18 @@ def test_conditions_of_a_run_share_a_panel(tmp_path, monkeypatch):
     plt.close("all")
 
 
+def test_all_of_many_delays_are_drawn(tmp_path, monkeypatch):
+    saved = []
+    monkeypatch.setattr(delays, "save_figure", lambda figure, path: saved.append(figure))
+    results = make_results(tmp_path)
+    cells = dict.fromkeys(map(str, delays.DELAYS), results[0]["cells"]["0"])
+    rows = [result | {"cells": cells, "row": row} for result in results for row in ("Only-RGB", "RGB+[P]")]
+    delays.plot_conditions(rows, tmp_path / "figure.png")
+    (panel,) = saved[0].axes
+    assert len(read_lines(panel)) == 1 + 2 * (len(delays.DELAYS) - 1)
+    plt.close("all")
+
+
 def read_lines(axis):
     return {bars.get_label(): bars.lines[0].get_xydata().tolist() for bars in axis.containers}
 

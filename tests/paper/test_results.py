@@ -1,11 +1,14 @@
 """Cells, merged from the results of their runs."""
 
+import json
+
 import pytest
-from made_up import TASK, write
+from made_up import TASK, flags, write
 from scipy.stats import t
 
 from dynmap_rl.evaluation.statistics import shared_interval
 from dynmap_rl.paper.results import count_commits, find_repeated, read_cells
+from dynmap_rl.utils.files import write_json
 
 KEY = TASK, "decoupled", "recurrent", "RGB+[P]"
 
@@ -30,6 +33,20 @@ def test_the_interval_over_world_models_is_students(tmp_path):
     assert summary["world_model_interval"] == pytest.approx((60 - half, 60 + half))
     write(tmp_path / "one", "RGB+[P]", 20)
     assert read_cells(tmp_path / "one")[KEY].summary["world_model_interval"] is None
+
+
+def test_results_on_other_scenes_are_refused(tmp_path):
+    write(tmp_path, "RGB+[P]", 40, 30)
+    path = sorted(tmp_path.glob("*.json"))[1]
+    result = json.loads(path.read_text())
+    for scenes in (
+        {"first_scene_seed": 9},
+        {name: flags(1, 30) for name in ("success", "dropped", "touched")},
+    ):
+        rows = [seed["test"]["rows"] | scenes for seed in result["results"]]
+        write_json(path, result | {"results": [{"test": {"rows": row}} for row in rows]})
+        with pytest.raises(ValueError, match=f"{path.name} must have the same scenes as"):
+            read_cells(tmp_path)
 
 
 def test_every_seed_of_joint_training_has_a_world_model(tmp_path):

@@ -4,6 +4,7 @@ import pytest
 from commands import PRESETS, run
 from own_task import check_renderer
 
+from dynmap_rl.paper.benchmarks import benchmark_rows
 from dynmap_rl.utils.files import read_json, write_json
 
 
@@ -50,8 +51,7 @@ def test_a_cell_is_trained_judged_and_tabled_once(tmp_path):
     assert (tmp_path / "found/plateslide_rgb_p_v_seed_0.gif").exists()
     result = read_json(tmp_path / "found/plateslide_act_seed_1.json")
     assert (result["row"], result["seeds"], result["test_protocol"]["episodes"]) == ("ACT", [1], 2)
-    rows = read_json(tmp_path / "found/table.json", list)
-    assert [(row["task"], row["method"]) for row in rows] == [
+    assert [(row["task"], row["method"]) for row in benchmark_rows(tmp_path / "found")] == [
         ("PlateSlide", "RGB+[P+V]"),
         ("PlateSlide", "ACT"),
         ("PlateSlide", "Diffusion Policy"),

@@ -4,6 +4,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+import torch
 from commands import run
 from small import CONSTANTS, make_model
 
@@ -14,9 +15,10 @@ from recipes.paper import delays
 RESULTS = Path(__file__).parents[2] / "recipes/results/delays"
 
 
-def make_run(folder, task="balance_reaching"):
+def make_run(folder, task="balance_reaching", seed=0):
     """Make a run, ``trained``, with an untrained policy."""
     world_model = make_model()
+    torch.manual_seed(seed)
     save_world_model(folder / "trained/world_model", world_model)
     policy = make_policy(CONSTANTS, "recurrent", world_model)
     save_policy(folder / "trained/seed_0/policy", policy, world_model)
@@ -29,7 +31,7 @@ def grid(tmp_path):
     make_run(tmp_path)
 
     def call(*arguments):
-        common = "--runs", "trained", "--eval.episodes", 2, "--results", "found", "--figure", "delays.png"
+        common = "--runs", "trained", "--eval.episodes", 2, "--results", "found"
         return run(tmp_path, "delays", *common, *arguments)
 
     return call
@@ -60,13 +62,19 @@ def test_cells_are_measured_once(grid, tmp_path):
             and read_json(path)["cells"]["2"] == found[name]["cells"]["2"]
         )
         assert path.read_bytes() != before[name]
-    assert (tmp_path / "delays.png").exists() and (tmp_path / "delays_conditions.png").exists()
+    assert {path.name for path in (tmp_path / "found").glob("*.png")} == {
+        "delays.png",
+        "delays_conditions.png",
+    }
     page = (tmp_path / "found/README.md").read_bytes()
     (tmp_path / "found/README.md").unlink()
     assert grid("--write").returncode == 0
     assert (tmp_path / "found/README.md").read_bytes() == page
     result = grid("--conditions", "stale", "--eval.split", "validation")
     assert result.returncode == 2 and "another split" in result.stderr
+    make_run(tmp_path, seed=1)
+    result = grid("--conditions", "stale", "--delays", "6")
+    assert result.returncode == 2 and "other weights" in result.stderr
     write_json(tmp_path / "trained/eval.json", {"command": "python recipes/decoupled.py", "commit": "abc"})
     result = grid("--conditions", "stale")
     assert result.returncode == 2 and "another training of the run" in result.stderr, (
@@ -86,7 +94,7 @@ def test_cells_that_another_process_has_added_stay(tmp_path, monkeypatch):
     path, result = delays.open_result(config, "balance_reaching", "stale")
     other = read_json(next(RESULTS.glob("balance_reaching_balance_reaching_seed_0_stale.json")))["cells"]["4"]
     write_json(path, result | {"cells": {"4": other}})
-    names = {"row": "RGB+[P+V]", "policy": "recurrent"}
+    names = {"row": "RGB+[P+V]", "policy": "recurrent", "weights_sha256": "a"}
     monkeypatch.setattr(delays, "load_actor", lambda *_: (None, names))
     summary = dict.fromkeys(("SR", "SR_interval", "DR", "DR_interval", "PE"), 1.0)
     found = {"test": {"summary": summary, "rows": {"success": "1"}}}

@@ -153,6 +153,7 @@ def test_real_cells(recordings, tmp_path):
     [
         (["--only", "radar"], "'radar'|radar"),
         (["--part", "half"], "'half'"),
+        (["--part", "data", "--only", "flow"], "no runs"),
         (["--architecture", "vit"], "'vit'"),
         (["--world_models", "0,3"], "0,3"),
         (["--write"], "results must have results"),

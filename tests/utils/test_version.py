@@ -2,7 +2,9 @@
 
 import subprocess
 
-from dynmap_rl.utils.version import find_commit
+from dynmap_rl.utils import version
+
+find_commit = version.find_commit.__wrapped__
 
 
 def git(folder, *arguments):
@@ -25,6 +27,12 @@ def test_a_commit_and_whether_the_code_differs_from_it(tmp_path):
     assert "dirty" not in find_commit(tmp_path)
     (tmp_path / "a.py").write_text("2\n")
     assert find_commit(tmp_path).endswith("-dirty")
+
+
+def test_a_process_asks_once(monkeypatch):
+    commit = version.find_commit()
+    monkeypatch.setattr(subprocess, "run", None)
+    assert version.find_commit() == commit
 
 
 def test_a_folder_inside_of_another_checkout_has_no_commit(tmp_path):
