@@ -201,7 +201,7 @@ class Actor(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Observe, act and predict."""
-        warn_without_memory(self, tensordict, self.memory)
+        warn_without_memory(self, tensordict, (*self.memory, *self.latent_actor.policy_memory))
         return self.predict(self.act(self.observe(tensordict)))
 
     def observe(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -108,7 +108,7 @@ def load_world_model(folder: Path) -> WorldModel:
             f"{folder} has the keypoints of the first release, which this one lacks; train it again"
         )
     arguments.setdefault("architecture", "plain")
-    if not 1 <= (cameras := arguments.get("cameras", 1)) <= MOST_CAMERAS:
+    if (cameras := arguments.get("cameras", 1)) not in range(1, MOST_CAMERAS + 1):
         raise ValueError(f"{folder}/arguments.json must have 1 to {MOST_CAMERAS} cameras, got {cameras}")
 
     def make() -> WorldModel:

@@ -35,7 +35,12 @@ class TwoLSTM(nn.Module):
         """Map ``[B, T, input]`` to ``hidden1``, ``hidden2`` ``[B, T, H]`` after each step, and the last state.
 
         Without ``state``, the windows begin with zeros.
+
+        Raises:
+            ValueError: the input is no batch of windows.
         """
+        if x.ndim != 3:  # nn.LSTM would take it as one window
+            raise ValueError(f"windows must be [B, T, ...], got an input of shape {list(x.shape)}")
         state1 = state2 = None
         if state is not None:
             h1, c1, h2, c2 = (s[None].contiguous() for s in state)

@@ -68,7 +68,9 @@ class RobotActor:
         Raises:
             ValueError: the goal has another size than the policy's, or is not finite.
         """
-        goal = torch.as_tensor(goal, dtype=torch.float32, device=self.device)
+        goal = torch.as_tensor(
+            goal, dtype=torch.float32, device=self.device
+        ).clone()  # the caller may reuse it
         policy = self.actor.actor.latent_actor.policy
         # A policy of one's own may not say how large its goal is.
         size = policy.goal.size if hasattr(policy, "goal") else goal.numel()

@@ -17,6 +17,7 @@ import sys
 import tempfile
 import typing
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 from .graphics import check_mujoco_gl
@@ -89,7 +90,13 @@ def parse_settings(config_class: type, arguments: Sequence[str]):
     file, arguments = parser.parse_known_args(arguments)
     settings = draccus.encode(config_class())
     if file.config_path:
-        mergedeep.merge(settings, read_settings(file.config_path))
+        given = read_settings(file.config_path)
+        for name, group in given.items():
+            if isinstance(settings.get(name), dict) and not isinstance(group, dict):
+                raise ValueError(
+                    f"{file.config_path} must have options under {name}, got {group!r}; correct it"
+                )
+        mergedeep.merge(settings, given)
     with tempfile.NamedTemporaryFile("w", suffix=".yaml") as merged:
         yaml.safe_dump(settings, merged)
         merged.flush()
@@ -162,37 +169,38 @@ def read_arguments(given: Sequence[str], config_class: type) -> list[str]:
     """Normalise arguments: ``--dry-run`` becomes ``--dry_run``, and a bare flag is followed by ``true``.
 
     Values are YAML. Those of texts and paths are quoted, as YAML would read ``#1c1c1c`` as a comment, ``yes`` as true and
-    ``2026-01-01`` as a date; ``null`` stays None.
+    ``2026-01-01`` as a date; ``null`` stays None where an option may be None.
 
     Raises:
         ValueError: an option is unknown, or a text begins with ``include``, a word of draccus.
     """
-    options, arguments, text = list_options(config_class), [], False
+    options, arguments, quote = list_options(config_class), [], None
     for i, argument in enumerate(given):
         name, equals, value = argument.partition("=")
         if not name.startswith("--"):
-            arguments.append(_quote(argument) if text else argument)
-            text = False
+            arguments.append(quote(argument) if quote else argument)
+            quote = None
             continue
         name = f"--{name[2:].replace('-', '_')}"
         if name not in {*options, "--help", "--config_path"}:
             raise ValueError(f"unknown option {name}; {_suggest(name, options)}")
         kind = options.get(name)
-        text = {*typing.get_args(kind), kind} & {str, Path} != set()
-        arguments.append(f"{name}={_quote(value) if text else value}" if equals else name)
-        text = text and not equals
+        kinds = {*typing.get_args(kind), kind}
+        quote = partial(_quote, optional=type(None) in kinds) if kinds & {str, Path} else None
+        arguments.append(f"{name}={quote(value) if quote else value}" if equals else name)
+        quote = None if equals else quote
         if kind is bool and not equals and "".join(given[i + 1 : i + 2]).lower() not in ("true", "false"):
             arguments.append("true")
     return arguments
 
 
-def _quote(value: str) -> str:
+def _quote(value: str, optional: bool) -> str:
     if value.startswith("include"):
         raise ValueError(
             f"a value must not begin with include, which draccus reads as a file to include, got {value}; write a path as "
             f"./{value}"
         )
-    return value if value == "null" else json.dumps(value, ensure_ascii=False)
+    return value if value == "null" and optional else json.dumps(value, ensure_ascii=False)
 
 
 def _suggest(name: str, options: dict[str, type]) -> str:

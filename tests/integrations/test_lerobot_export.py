@@ -99,6 +99,22 @@ def test_task_and_source_of_a_run_are_kept(tmp_path):
         load_world_model_of(import_from_lerobot(unfinished, tmp_path / "again", seed=1))
 
 
+def test_the_source_is_that_of_the_shared_world_model(tmp_path):
+    exported = {}
+    for name, training in (("a", "decoupled"), ("b", None), ("c", "joint")):
+        make_run(tmp_path / name, "recurrent")
+        if training:
+            source = {"task": "balance_reaching", "training": training}
+            write_json(tmp_path / name / "eval.json", {"world_model": source, "results": [{}]})
+        exported[name] = export_to_lerobot(tmp_path / name, tmp_path / f"exported_{name}", seed=1)
+    both = import_from_lerobot(exported["a"], tmp_path / "both")
+    import_from_lerobot(exported["c"], both, seed=1)  # has a world model of its own
+    assert load_world_model_of(both)[1]["training"] == "decoupled"
+    import_from_lerobot(exported["b"], import_from_lerobot(exported["a"], tmp_path / "again"))
+    with pytest.raises(ValueError, match="again"):
+        load_world_model_of(tmp_path / "again")
+
+
 def test_a_policy_of_lerobot_train_has_the_task_of_its_dataset(recording, tmp_path):
     dataset = LeRobotDataset("user/small", root=recording, video_backend="pyav")
     config = make_policy_config("dynmap", device="cpu", push_to_hub=False)
@@ -226,6 +242,7 @@ def test_a_late_chunk_is_cut_at_the_present_step(tmp_path, monkeypatch):
         LeRobotActor(policy, cut=True)
     monkeypatch.setattr(DynmapConfig, "n_action_steps", 2, raising=False)
     actor = LeRobotActor(policy, cut=True)
+    assert "delay" in actor.in_keys and "delay" not in LeRobotActor(policy).in_keys
 
     def predict(batch):
         calls.append(batch)
@@ -302,6 +319,8 @@ def test_cameras_of_a_task_are_found_by_their_names(tmp_path):
 def test_a_policy_of_another_task_is_refused(tmp_path):
     policy = export_with_cameras(tmp_path, "side")
     LeRobotActor(policy, task=get_task("balance_reaching"))  # the picture of a flat task may have any name
+    with pytest.raises(ValueError, match=r"side of \[64, 64\] pixels instead of \[96, 96\]"):
+        LeRobotActor(policy, task=make_task("side", image_size=96))
     with pytest.raises(ValueError, match="fit slide.* cameras side instead of front; choose the task"):
         LeRobotActor(policy, task=make_task("front"))
     task = make_task("front", "side", state=("goal_x",), action=("x",), action_limit=(1.0,))

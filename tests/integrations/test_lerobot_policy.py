@@ -199,6 +199,10 @@ def test_late_frames_and_chunks(recording, kind, tmp_path):
     for t in (0, 3, 5):
         expected = chunks.act(episode["pixels"][:, t], episode["goal"][:, t], t)
         assert torch.equal(policy.predict_action_chunk(frames(t, t)), expected)
+    mixed = frames(0, 0)
+    mixed["observation.state"][1, 0] = 7
+    with pytest.raises(ValueError, match="one step"):
+        policy.predict_action_chunk(mixed)
     policy.reset(), chunks.reset()
     for t in (0, 1):  # without the number of the step
         expected = chunks.act(episode["pixels"][:, t], episode["goal"][:, t])
@@ -215,6 +219,12 @@ def test_late_frames_and_chunks(recording, kind, tmp_path):
         ({"supervision": "none", "beta_dynamics": 2.0}, "beta_dynamics has no effect"),
         ({"delay": 20}, "delay"),
         ({"delay": -1}, "delay"),
+        ({"rgb_frames": 0}, "rgb_frames must be at least 1"),
+        ({"latent_size": 0}, "latent_size"),
+        ({"hidden_size": -3}, "hidden_size"),
+        ({"width": -4}, "width"),
+        ({"optimizer_lr": -1.0}, "optimizer_lr"),
+        ({"rarity": 2.0}, "rarity"),
     ],
 )
 def test_wrong_settings_are_refused(settings, message):

@@ -175,6 +175,21 @@ def test_an_actor_without_memory_warns(make):
         actor(td.copy())
 
 
+def test_a_policy_without_its_memory_gets_the_warning_too():
+    actor = make_actor()
+    states = {key: torch.zeros(2, 24) for key in actor.memory}  # as of a WorldModelTransform
+    td = make_frames()[:, 0].select("pixels", "goal").update(states)
+    actor(td.copy())
+    with pytest.warns(UserWarning, match="make_tensordict_primer"):
+        actor(td.copy())
+
+
+def test_is_init_of_another_shape_is_refused():
+    begins = torch.zeros(2, dtype=torch.bool)
+    with pytest.raises(ValueError, match=r"is_init must be of shape \[2, 1\], got \[2\]"):
+        make_actor()(make_frames()[:, 0].select("pixels", "goal").set("is_init", begins))
+
+
 @pytest.mark.parametrize("kind", ["feedforward", "recurrent"])
 def test_a_goal_of_another_type_is_the_same_goal(kind):
     frames = make_frames()[:, 0]

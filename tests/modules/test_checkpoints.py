@@ -91,6 +91,12 @@ def test_wrong_arguments_are_refused_before_memory_is_taken(saved, monkeypatch, 
     assert made in ([], ["meta"])
 
 
+@pytest.mark.parametrize("cameras", [0, 10**9, "2", None, [1]])
+def test_a_wrong_number_of_cameras_is_refused(saved, cameras):
+    with pytest.raises(ValueError, match="cameras, got"):
+        load_world_model(saved("world_model", cameras=cameras))
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -197,6 +197,14 @@ def test_a_camera_may_use_its_buffer_again():
     np.testing.assert_array_equal(robot.act(0.0), run_in_steps([[0]])[0])
 
 
+def test_a_goal_may_be_changed_by_its_owner():
+    goal = GOAL.astype(np.float32)
+    robot = RobotActor(make_actor())
+    robot.reset(goal)
+    goal[:] = 9
+    np.testing.assert_allclose(robot.goal.numpy(), GOAL, rtol=1e-6)
+
+
 def test_wrong_use_gets_one_clear_error():
     robot = RobotActor(make_actor())
     with pytest.raises(ValueError, match="reset"):

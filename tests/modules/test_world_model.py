@@ -1,5 +1,7 @@
 """World model: sequence form against step form, and the time step that each entry belongs to."""
 
+from functools import partial
+
 import pytest
 import torch
 from small import CONSTANTS, make_model
@@ -49,6 +51,14 @@ def test_sequence_equals_steps():
         torch.testing.assert_close(hidden1[:, t], state[0], rtol=1e-5, atol=1e-5)
         torch.testing.assert_close(hidden2[:, t], state[2], rtol=1e-5, atol=1e-5)
         guess, state = model.step(model.encode(td["pixels"][:, t]), td["action"][:, t], state)
+
+
+def test_a_window_without_a_batch_is_refused():
+    model, td = make(), batch()[0]
+    latent = model.encode(td["pixels"])
+    for predict in (model.predict, partial(model.transition.imagine, context=2)):
+        with pytest.raises(ValueError, match=r"\[B, T, \.\.\.\], got"):
+            predict(latent, td["action"])
 
 
 @pytest.mark.parametrize("kind", ["feedforward", "recurrent"])

@@ -68,6 +68,10 @@ def test_null_clears_an_option(run, tmp_path):
     assert run("--config_path", str(tmp_path / "file.yaml"), "--output", "null") == Settings()
 
 
+def test_null_is_a_text_where_an_option_must_have_one(run):
+    assert run("--color", "null") == Settings(color="null") == run("--color=null")
+
+
 def test_a_nested_option_leaves_the_other_defaults_of_its_group(run):
     assert run("--second.updates", "7") == Settings(second=Group(7, 0.5))
 
@@ -115,7 +119,7 @@ def test_a_file_of_settings_and_options_that_override_it(run, tmp_path):
     assert run("--config_path", str(tmp_path / "small.yaml"), "--second.updates", "9") == expected
 
 
-@pytest.mark.parametrize("content", ["[1]", "steps: [", "stepz: 1"])
+@pytest.mark.parametrize("content", ["[1]", "steps: [", "stepz: 1", "first:", "# bad.yaml\nfirst: 3"])
 def test_a_damaged_file_of_settings_is_one_line(run, tmp_path, capsys, content):
     (tmp_path / "bad.yaml").write_text(content)
     with pytest.raises(SystemExit) as end:

@@ -41,7 +41,6 @@ class LeRobotActor(TensorDictModuleBase):
     Calling it raises ``ValueError`` where the frames are those of another number of cameras.
     """
 
-    in_keys = ["pixels", "agent_pos"]
     out_keys = ["action"]
 
     def __init__(
@@ -52,6 +51,7 @@ class LeRobotActor(TensorDictModuleBase):
         cut: bool = False,
     ):
         super().__init__()
+        self.in_keys = ["pixels", "agent_pos", *(["delay"] if cut else [])]
         self.instruction, self.cut, self.cameras = task.description if task else "", cut, None
         try:
             config = PreTrainedConfig.from_pretrained(str(path))
@@ -107,7 +107,8 @@ class LeRobotActor(TensorDictModuleBase):
     def _cut(self, batch: dict, delay: torch.Tensor) -> torch.Tensor:
         """Return the next action of the chunk; of a new chunk, that for the present step."""
         if self._chunk is None or self._next == self.policy.config.n_action_steps:
-            self._chunk, self._next, self._first = self.policy.predict_action_chunk(batch), 0, delay
+            self._chunk, self._next = self.policy.predict_action_chunk(batch), 0
+            self._first = delay.to(self._chunk.device)
         last = self._chunk.shape[1] - 1  # where a chunk is shorter than the delay, its last action
         place = (self._first + self._next).clamp(max=last)[..., None].expand(-1, -1, self._chunk.shape[2])
         self._next += 1
@@ -121,6 +122,12 @@ def check_config(config: PreTrainedConfig, task: BaseTask) -> None:
     if not names or (len(names) > 1 if task.planar else set(names) - set(layout.cameras)):
         found, expected = (", ".join(some) or "none" for some in (names, layout.cameras))
         wrong.append(f"the cameras {found} instead of {expected}")
+    size = 2 * [layout.image_size]
+    wrong += [
+        f"{name} of {list(feature.shape[-2:])} pixels instead of {size}"
+        for name, feature in config.image_features.items()
+        if list(feature.shape[-2:]) != size
+    ]
     sizes = {
         "state": (config.robot_state_feature, layout.state),
         "action": (config.action_feature, layout.action),

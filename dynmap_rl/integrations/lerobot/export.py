@@ -114,6 +114,8 @@ def import_from_lerobot(folder: str | Path, run: str | Path, seed: int = 0) -> P
     shutil.rmtree(seed_folder, ignore_errors=True)  # a policy must never lie beside another world model
     save_world_model(first if shared else seed_folder / "world_model", policy.world_model)
     save_policy(seed_folder / "policy", policy.policy, policy.world_model)
-    if source:
+    if shared and source:
         write_json(run / "eval.json", {"world_model": source, "imported_from": str(folder)})
+    elif not needed:  # what is there is of the world model that was there
+        (run / "eval.json").unlink(missing_ok=True)
     return run

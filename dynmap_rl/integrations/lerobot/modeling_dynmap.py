@@ -190,10 +190,15 @@ class DynmapPolicy(PreTrainedPolicy):
             batch: frames ``[B, 3, 64, 64]``; states ``[B, 5]`` or, with the number of the step in front, ``[B, 6]``.
                 Without this number, the whole last chunk has been executed since the last frame.
             kwargs: not used.
+
+        Raises:
+            ValueError: the numbers of the steps differ.
         """
         self.eval()
         state = batch[OBS_STATE]
         numbered = state.shape[-1] > self.config.robot_state_feature.shape[0]
+        if numbered and (state[:, 0] != state[0, 0]).any():
+            raise ValueError(f"frames of a batch must be of one step, got steps {state[:, 0].tolist()}")
         step = int(state[0, 0]) if numbered else None
         return self._chunks.act(to_bytes(batch[self.config.camera]), state[:, -GOAL:], step)
 
