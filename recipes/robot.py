@@ -160,7 +160,10 @@ def check_config(config: Config) -> None:
 def describe_pieces(data: dict) -> str:
     """Return what is trained on and held out as text."""
     held_out = ", ".join(map(str, data["splits"]["eval"]))
-    text = f"pieces of {data['steps']} steps; held out: episodes {held_out}"
+    text = f"pieces of {data['steps']} steps"
+    if data["steps"] in (lengths := data["lengths"]).values():  # otherwise all are longer
+        text += f", as long as episode {next(e for e, n in lengths.items() if n == data['steps'])}"
+    text += f"; held out: episodes {held_out}"
     if data["left_out"]:
         text += f"; left out, as too short: {', '.join(map(str, data['left_out']))}"
     if data["info"].get("total_tasks", 1) > 1 and not data["goal"]:

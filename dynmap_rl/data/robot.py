@@ -43,7 +43,8 @@ def describe_robot_dataset(
     Returns:
         ``root``, ``info`` (content of ``meta/info.json``), ``cameras``, ``goal`` (column and entries, or None), ``names``
         (of the entries of ``action`` and of every dynamics quantity that the dataset has), ``steps`` (T of the pieces),
-        ``splits`` (episodes of ``train`` and ``eval``) and ``left_out`` (episodes that are too short).
+        ``splits`` (episodes of ``train`` and ``eval``), ``left_out`` (episodes that are too short) and ``lengths``
+        (steps of every episode).
 
     Raises:
         ValueError: the dataset is missing or damaged, lacks a column, or has too few episodes that are long enough.
@@ -64,8 +65,15 @@ def describe_robot_dataset(
     goal = _check_goal(root, info, goal)
     rows = spans(read_table(root, info, [])["episode_index"].to_numpy())
     lengths = {episode: span.stop - span.start for episode, span in rows}
-    steps = _choose_steps([*lengths.values()], min_steps)
-    usable = [episode for episode, length in lengths.items() if length >= steps]
+    usable = [episode for episode, length in lengths.items() if length >= min_steps]
+    if len(usable) < 2 <= len(lengths):
+        raise ValueError(
+            f"{root} must have two episodes of at least {min_steps} steps, the length of windows, but the second longest has "
+            f"{sorted(lengths.values())[-2]}; choose a shorter window_steps, or record longer episodes"
+        )
+    splits = choose_splits(root, info, [*lengths], usable)
+    steps = _choose_steps(lengths, splits, min_steps)
+    splits = {name: [e for e in members if lengths[e] >= steps] for name, members in splits.items()}
     return {
         "root": root,
         "info": info,
@@ -73,8 +81,9 @@ def describe_robot_dataset(
         "goal": goal,
         "names": {key: entry_names(info, column) for key, column in columns.items()},
         "steps": steps,
-        "splits": choose_splits(root, info, [*lengths], usable),
-        "left_out": [episode for episode in lengths if episode not in usable],
+        "splits": splits,
+        "left_out": [episode for episode, length in lengths.items() if length < steps],
+        "lengths": lengths,
     }
 
 
@@ -90,10 +99,10 @@ def load_robot_dataset(
 
     Frames are resized to S x S with ``cv2.INTER_AREA``, whatever their aspect; those of several cameras stand side by
     side. Episodes are cut into pieces of T steps, at most 120, or ``min_steps`` if that is more. Of the episodes with
-    ``min_steps``, a tenth may be shorter than T, so that a few short takes do not shorten all pieces; all shorter episodes
-    are left out. As many pieces as needed cover an episode, evenly spread; they overlap where T does not divide its length.
+    ``min_steps``, a tenth may be shorter than T, so that a few short takes do not shorten all pieces, but not all of a split;
+    all shorter episodes are left out. As many pieces as needed cover an episode, evenly spread; they overlap where T does not divide its length.
     No piece crosses the border of an episode. Splits named ``train`` and ``eval``, ``test`` or ``val`` are kept; otherwise
-    every tenth episode of all is held out, or the last one of fewer than ten. All pieces of an episode are in one split.
+    every tenth episode of all is held out, or the last one that is long enough where there is none of these. All pieces of an episode are in one split.
 
     Args:
         dataset: local folder or hub id.
@@ -192,11 +201,11 @@ def _check_goal(root: Path, info: dict, goal: str | None) -> tuple[str, list[int
     return column, entries
 
 
-def _choose_steps(lengths: list[int], min_steps: int) -> int:
-    """Return the steps of the pieces for the lengths of all episodes."""
-    enough = [length for length in lengths if length >= min_steps]
-    shortest = int(np.quantile(enough, 0.1, method="lower")) if enough else min_steps
-    return min(max(LONGEST, min_steps), shortest)
+def _choose_steps(lengths: dict[int, int], splits: dict[str, list[int]], min_steps: int) -> int:
+    """Return the steps of the pieces: a tenth of the episodes may be shorter, but not all of a split."""
+    by_split = [[lengths[episode] for episode in members] for members in splits.values()]
+    shortest = int(np.quantile(np.concatenate(by_split), 0.1, method="lower"))
+    return min(max(LONGEST, min_steps), shortest, *map(max, by_split))
 
 
 def _starts(length: int, steps: int) -> list[int]:

@@ -32,11 +32,12 @@ class RobotActor:
 
     A call may be late by up to three quarters of a period. Where it is later, control steps were missed, which count as
     steps with an action of zero, or with the last one again (``hold``); after a longer gap than ``max_delay`` steps, the
-    robot is at rest, and only the last ``max_delay`` of them count.
+    robot is at rest, and only the last ``max_delay`` of them count. After ten late calls in a row, :meth:`act` warns that
+    ``period`` may be wrong.
 
     Args:
         actor: world model and policy; its ``max_delay`` is the age of the oldest frames that are used.
-        period: duration of a control step, in the unit of the timestamps (s).
+        period: duration of a control step, in the unit of the timestamps (s): that of the demonstrations, 1 / fps.
         hold: whether a missed step repeats the last action, as a robot does whose actions are targets; those of cart and
             block are changes, which end.
 
@@ -76,7 +77,7 @@ class RobotActor:
         size = policy.goal.size if hasattr(policy, "goal") else goal.numel()
         if goal.shape != (size,) or not goal.isfinite().all():
             raise ValueError(f"goal must be {size} finite numbers, got {goal.tolist()}")
-        self.goal, self.unused = goal, 0
+        self.goal, self.unused, self.late = goal, 0, 0
         self.since, self.memory, self.actor.blind = since, TensorDict({}, device=self.device), False
         self.frames: list[tuple[float, np.ndarray]] = []
         self.times: deque[float] = deque(maxlen=self.actor.max_delay + 1)  # of the last steps
@@ -175,6 +176,13 @@ class RobotActor:
         """
         last = self.times[-1]
         steps = max(1, math.floor((now - self.start) / self.period + 1 - LATE) - self.step)
+        self.late = self.late + 1 if steps > 1 else 0
+        if self.late == 10:
+            warnings.warn(
+                f"the last 10 calls of act came more than a period of {self.period} after the one before; is it 1 / fps of "
+                "the demonstrations?",
+                stacklevel=3,
+            )
         for i in range(max(1, steps - self.actor.max_delay), steps):
             self.times.append(last + i * (now - last) / steps)
             td = self.actor.observe(self.memory.copy())

@@ -21,6 +21,13 @@ def test_every_tenth_episode_is_held_out():
     assert splits["eval"] == [9, 19] and splits["train"] == [e for e in range(25) if e not in (9, 19)]
 
 
+def test_an_episode_is_held_out_where_every_tenth_is_left_out():
+    splits = choose_splits(Path(), {}, list(range(12)), usable=set(range(12)) - {9})
+    assert splits["eval"] == [11] and splits["train"] == [*range(9), 10]
+    splits = choose_splits(Path(), {}, list(range(8)), usable=range(7))
+    assert splits == {"train": [*range(6)], "eval": [6]}
+
+
 def test_what_is_held_out_does_not_depend_on_what_is_left_out():
     splits = choose_splits(Path(), {}, list(range(25)), usable=set(range(25)) - {3, 9})
     assert splits["eval"] == [19] and not {3, 9, 19} & {*splits["train"]} and len(splits["train"]) == 22

@@ -111,6 +111,26 @@ def test_a_short_take_neither_shortens_the_pieces_nor_changes_what_is_held_out(t
     assert load_robot_dataset(root, 10)[0]["eval"].shape == (4, 31)
 
 
+@pytest.mark.parametrize(
+    ("lengths", "steps", "held_out"),
+    [
+        ([30] * 9 + [29] + [30] * 2, 29, [9]),  # the only one that is held out
+        ([30] * 9 + [5] + [30] * 2, 30, [11]),
+        ([30, 30, 30, 5], 30, [2]),
+    ],
+)
+def test_a_short_take_may_be_the_one_that_is_held_out(tmp_path, lengths, steps, held_out):
+    found = describe_robot_dataset(make_robot_dataset(tmp_path / "takes", lengths), min_steps=10)
+    assert (found["steps"], found["splits"]["eval"]) == (steps, held_out)
+    assert found["lengths"] == dict(enumerate(lengths))
+
+
+def test_windows_longer_than_episodes_are_refused_with_the_lengths(tmp_path):
+    root = make_robot_dataset(tmp_path / "takes", [12, 30, 14])
+    with pytest.raises(ValueError, match="two episodes of at least 24 steps.* second longest has 14"):
+        describe_robot_dataset(root, min_steps=24)
+
+
 def test_a_number_that_is_missing_is_named_with_its_place(folders, tmp_path):
     root = shutil.copytree(folders / "dynamics", tmp_path / "broken")
     [path] = (root / "data").rglob("*.parquet")

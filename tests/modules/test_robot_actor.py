@@ -239,6 +239,15 @@ def test_wrong_use_gets_one_clear_error():
         RobotActor(make_actor(), period=0)
 
 
+def test_a_wrong_period_gets_a_warning():
+    robot = make_robot()
+    robot.observe(FRAMES[0], 0.0)
+    for call in range(14):
+        with pytest.warns(UserWarning, match="1 / fps") if call == 10 else warnings.catch_warnings():
+            warnings.simplefilter("default" if call == 10 else "error")
+            robot.act(call * 0.1)  # every second step of 0.05 s
+
+
 @pytest.mark.parametrize("ahead", [0.9, 1.1])
 def test_a_frame_may_be_taken_up_to_a_period_after_the_call(ahead):
     robot = make_robot()

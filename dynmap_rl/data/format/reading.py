@@ -128,9 +128,9 @@ def choose_splits(
     Args:
         root: folder of the dataset.
         info: content of its ``meta/info.json``. Splits named there, ``train`` and ``eval``, ``test`` or ``val``, are
-            kept; otherwise every tenth episode is held out, or the last one of fewer than ten.
+            kept; otherwise every tenth episode is held out, or the last usable one where there is none of these.
         episodes: indices of all episodes.
-        usable: those that are kept, by default all. What is held out does not depend on it.
+        usable: those that are kept, by default all.
 
     Raises:
         ValueError: there are fewer than two episodes, or splits are empty or share episodes.
@@ -146,7 +146,8 @@ def choose_splits(
             )
         splits = {name: [e for e in episodes if e in members[name]] for name in members}
     else:
-        held_out = episodes[9::10] or episodes[-1:]
+        kept = [e for e in episodes if usable is None or e in usable]
+        held_out = [e for e in episodes[9::10] if e in kept] or kept[-1:]
         splits = {"train": [e for e in episodes if e not in held_out], "eval": held_out}
     if usable is not None:
         splits = {name: [e for e in members if e in usable] for name, members in splits.items()}
