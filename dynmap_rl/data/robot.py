@@ -99,10 +99,11 @@ def load_robot_dataset(
 
     Frames are resized to S x S with ``cv2.INTER_AREA``, whatever their aspect; those of several cameras stand side by
     side. Episodes are cut into pieces of T steps, at most 120, or ``min_steps`` if that is more. Of the episodes with
-    ``min_steps``, a tenth may be shorter than T, so that a few short takes do not shorten all pieces, but not all of a split;
-    all shorter episodes are left out. As many pieces as needed cover an episode, evenly spread; they overlap where T does not divide its length.
-    No piece crosses the border of an episode. Splits named ``train`` and ``eval``, ``test`` or ``val`` are kept; otherwise
-    every tenth episode of all is held out, or the last one that is long enough where there is none of these. All pieces of an episode are in one split.
+    ``min_steps``, a tenth may be shorter than T, but not all of a split, so that a few short takes do not shorten all
+    pieces; all shorter episodes are left out. As many pieces as needed cover an episode, evenly spread; they overlap where
+    T does not divide its length. No piece crosses the border of an episode. Splits named ``train`` and ``eval``, ``test``
+    or ``val`` are kept; otherwise every tenth episode of all is held out, or the last one that is long enough where there
+    is none of these. All pieces of an episode are in one split.
 
     Args:
         dataset: local folder or hub id.

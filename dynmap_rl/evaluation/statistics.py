@@ -164,9 +164,9 @@ def outcome_gap(terms: Sequence[tuple[int, list[list[dict]]]], outcome: str = "s
 
     Returns:
         ``gap``, the sum of the means with their signs, in percentage points or mm; its 95 % ``interval`` over the start
-        states, after averaging over policy seeds, None if they do not differ; and ``p``, the two-sided probability of a gap of this size if the
-        true gap is zero. Those of flags are by bootstrap, and exact over exchanges of the sign in every start state;
-        those of ``position_error`` are by a t test.
+        states, after averaging over policy seeds, None if they do not differ; and ``p``, the two-sided probability of a
+        gap of this size if the true gap is zero. Those of flags are by bootstrap, and exact over exchanges of the sign in
+        every start state; those of ``position_error`` are by a t test.
 
     Raises:
         ValueError: the results are not on the same scenes.

@@ -25,10 +25,8 @@ def find(tensordict: TensorDictBase, key: NestedKey) -> torch.Tensor | TensorDic
 def recall(tensordict: TensorDictBase, sizes: dict, is_init: NestedKey, device) -> tuple[torch.Tensor, ...]:
     """Return the entries of ``sizes``; zeros where an episode begins, and where they and ``is_init`` are absent."""
     batch, begins = tensordict.batch_size, find(tensordict, is_init)
-    if begins is not None and begins.shape != (
-        *batch,
-        1,
-    ):  # it might be taken for one of the entries of a memory
+    # [B] would be broadcast over the entries of a memory where their number is B.
+    if begins is not None and begins.shape != (*batch, 1):
         raise ValueError(f"{is_init} must be of shape {[*batch, 1]}, got {list(begins.shape)}")
     check_memory(tensordict, sizes, begins)
     found = {key: find(tensordict, key) for key in sizes}

@@ -71,7 +71,7 @@ class RobotActor:
         """
         goal = torch.as_tensor(
             goal, dtype=torch.float32, device=self.device
-        ).clone()  # the caller may reuse it
+        ).clone()  # its owner may change it
         policy = self.actor.actor.latent_actor.policy
         # A policy of one's own may not say how large its goal is.
         size = policy.goal.size if hasattr(policy, "goal") else goal.numel()

@@ -14,7 +14,7 @@ from dynmap_rl.reporting.media import choose_episodes
 from dynmap_rl.utils.files import read_json
 
 from .cells import Run
-from .results import count_devices, read_results
+from .results import count_devices, read_on_same_scenes
 from .tables import cause_table, commits_text, devices_text, gap_text, join_table
 
 TASKS = "FetchPush", "FetchSlide", "PlateSlide", "Soccer"
@@ -158,7 +158,8 @@ def read_benchmarks(results: Path) -> dict[tuple[str, str], list[dict]]:
     """Read the results by task and method, each a list of the seeds that are there."""
     cells = dict.fromkeys((task, method) for task, method, _ in list_benchmarks())
     found = {
-        cell: read_results(results / f"{name_run(*cell, seed)}.json" for seed in SEEDS) for cell in cells
+        cell: read_on_same_scenes(results / f"{name_run(*cell, seed)}.json" for seed in SEEDS)
+        for cell in cells
     }
     return {cell: seeds for cell, seeds in found.items() if seeds}
 

@@ -128,11 +128,11 @@ def read_cells(results: Path, tables: Iterable[str] = tuple(COLUMNS)) -> dict[Ke
 
 
 def _read_cell(results: Path, key: Key, runs: list[Run]) -> Cell:
-    found = read_results([results / f"{run.name}.json" for run in runs])
+    found = read_on_same_scenes([results / f"{run.name}.json" for run in runs])
     return Cell(key, runs[0].table, tuple(found), len(runs) - len(found))
 
 
-def read_results(paths: Iterable[Path]) -> list[dict]:
+def read_on_same_scenes(paths: Iterable[Path]) -> list[dict]:
     """Read those results that are there; they must be on the same start states.
 
     Raises:

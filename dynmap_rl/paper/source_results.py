@@ -16,7 +16,7 @@ from dynmap_rl.modules.world_model import WorldModel
 from dynmap_rl.reporting.figures import plt, save_figure
 from dynmap_rl.utils.files import read_json
 
-from .results import read_results
+from .results import read_on_same_scenes
 from .sources import DATA_ROWS, POLICIES, SIZES, SOURCES, WORLD_MODELS, dataset_folder, name_run
 from .tables import gap_text, join_table
 
@@ -95,7 +95,7 @@ def read_source(results: Path, task: str, source: str, policy: str, size: int = 
     """
     names = [name_run(task, source, seed, policy, size) for seed in WORLD_MODELS]
     names = names[:1] if source == "end_to_end" else names
-    found = read_results(results / f"{name}.json" for name in names)
+    found = read_on_same_scenes(results / f"{name}.json" for name in names)
     if not found:
         return None
     by_model = [result_rows(result) for result in found]

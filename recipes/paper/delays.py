@@ -22,7 +22,7 @@ from dynmap_rl.training.settings import PolicyTraining
 from dynmap_rl.utils.cli import command_line, refuse, run_recipe
 from dynmap_rl.utils.devices import Compute
 
-RESULTS = Path(__file__).parents[1] / "results"
+RESULTS = Path(__file__).resolve().parents[1] / "results"
 
 
 @dataclass(frozen=True)
@@ -189,7 +189,7 @@ def write(config: Config) -> None:
 
     if not (results := read_delays(config.results)):
         raise ValueError(f"{config.results} must have results; run recipes/paper/delays.py first")
-    media = RESULTS / "media" if config.results == RESULTS / "delays" else config.results
+    media = RESULTS / "media" if config.results.resolve() == RESULTS / "delays" else config.results
     plot_delays(results, media / "delays.png")
     plot_conditions(results, media / "delays_conditions.png")
     write_bytes(config.results / "README.md", delay_page(results).encode())

@@ -136,6 +136,7 @@ def choose_splits(
         ValueError: there are fewer than two episodes, or splits are empty or share episodes.
     """
     named = info.get("splits") or {}
+    kept = episodes if usable is None else [e for e in episodes if e in usable]
     held_out = next((name for name in ("eval", "test", "val") if name in named), None)
     if "train" in named and held_out:
         members = {"train": read_split(root, info, "train"), "eval": read_split(root, info, held_out)}
@@ -144,13 +145,10 @@ def choose_splits(
                 f"the splits train and {held_out} of {root} must not share episodes, got {shared[0]} to {shared[-1]} in "
                 "both; correct meta/info.json"
             )
-        splits = {name: [e for e in episodes if e in members[name]] for name in members}
+        splits = {name: [e for e in kept if e in members[name]] for name in members}
     else:
-        kept = [e for e in episodes if usable is None or e in usable]
         held_out = [e for e in episodes[9::10] if e in kept] or kept[-1:]
-        splits = {"train": [e for e in episodes if e not in held_out], "eval": held_out}
-    if usable is not None:
-        splits = {name: [e for e in members if e in usable] for name, members in splits.items()}
+        splits = {"train": [e for e in kept if e not in held_out], "eval": held_out}
     if len(episodes) < 2:
         raise ValueError(
             f"{root} must have at least two episodes, one to train on and one held out; record more"
