@@ -21,11 +21,12 @@ import torch
 from filelock import FileLock
 from tensordict import TensorDict
 
-from dynmap_rl.utils.files import check_space
+from dynmap_rl.utils.files import check_space, read_json, write_json
 
 from .decoding import Allocate
 
 FORMAT = 1  # of the entries
+SIZES = "sizes.json"  # of the files of an entry, written last
 # Without this flag, which Python names from 3.13 on, Linux refuses to map files that are larger than its memory.
 NORESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000 if sys.platform == "linux" else 0)
 
@@ -33,7 +34,7 @@ NORESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000 if sys.platform == "linux" els
 def open_cached(
     root: Path, settings: object, build: Callable[[Allocate], None], cache: Path | None = None
 ) -> TensorDict:
-    """Open the decoded episodes of a dataset, which are built where they are missing or stale.
+    """Open the decoded episodes of a dataset, which are built where they are missing, stale or cut short.
 
     Other processes wait for the one that builds. Entries of other content or settings are deleted.
 
@@ -54,10 +55,10 @@ def open_cached(
     name = hash_content(root, settings)
     entry = place / name
     try:
-        if not entry.exists():
+        if not _is_whole(entry):
             place.mkdir(parents=True, exist_ok=True)
             with FileLock(place / ".lock"):
-                if not entry.exists():
+                if not _is_whole(entry):
                     _build(entry, build)
                     for other in place.iterdir():
                         if other.is_dir() and other != entry:
@@ -114,9 +115,27 @@ def _build(entry: Path, build: Callable[[Allocate], None]) -> None:
             return values
 
         build(allocate)
+        write_json(temporary / SIZES, _measure(temporary))
+        if entry.exists():  # not whole
+            shutil.rmtree(entry.rename(entry.with_suffix(".old.tmp")))
         temporary.replace(entry)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _is_whole(entry: Path) -> bool:
+    """Return whether an entry exists and its files have their sizes: a copy that was cut short would be read as zeros."""
+    try:
+        sizes = read_json(entry / SIZES)
+    except (FileNotFoundError, ValueError):
+        return False
+    return sizes == _measure(entry)
+
+
+def _measure(entry: Path) -> dict[str, int]:
+    """Return the size of every file of an entry (bytes)."""
+    files = (path for path in entry.rglob("*") if path.is_file() and path != entry / SIZES)
+    return {path.relative_to(entry).as_posix(): path.stat().st_size for path in files}
 
 
 def _map(entry: Path) -> TensorDict:

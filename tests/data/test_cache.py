@@ -76,6 +76,16 @@ def test_a_changed_file_makes_the_cache_stale(copy, decoded):
     assert decoded == [copy, copy] and old not in list_entries(copy) and len(list_entries(copy)) == 1
 
 
+@pytest.mark.parametrize("name", ["action.memmap", "meta.json", "sizes.json"])
+def test_an_entry_that_was_cut_short_is_built_again(copy, decoded, name):
+    episodes = load_dataset(copy).clone()  # reading a map of a shorter file ends the process
+    (entry,) = list_entries(copy)
+    os.truncate(entry / name, (entry / name).stat().st_size // 2)
+    assert (load_dataset(copy) == episodes).all()
+    assert decoded == [copy, copy] and list_entries(copy) == [entry]
+    assert (load_dataset(copy) == episodes).all() and len(decoded) == 2
+
+
 def test_a_kill_while_a_stale_entry_is_deleted_leaves_no_part_of_it(copy, monkeypatch):
     load_dataset(copy)
     (old,) = list_entries(copy)
