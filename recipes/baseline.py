@@ -87,7 +87,7 @@ def main(config: Config) -> None:
         print(f"{folder} is complete; delete it to run again\n\n{row_text(read_json(folder / 'eval.json'))}")
         return
     torch.set_num_threads(config.compute.threads)
-    dataset = find_or_record(config.task, config.dataset, folder)
+    dataset = find_or_record(config.task, config.dataset, folder, config.compute.threads)
     for seed in seeds:
         if not (folder / f"seed_{seed}/eval.json").exists():
             train(config, dataset, folder / f"seed_{seed}", seed, str(device))
@@ -108,12 +108,15 @@ def train(config: Config, dataset: str | Path, folder: Path, seed: int, device: 
     import shutil
 
     from dynmap_rl.data.format.reading import find_dataset, read_info, read_split
+    from dynmap_rl.utils.files import read_json
     from dynmap_rl.utils.processes import run_script
 
     output, root = folder.absolute() / "lerobot", find_dataset(dataset).absolute()
     settings = output / TRAINED / "train_config.json"
     if settings.exists():
-        arguments = [f"--config_path={settings}", "--resume=true", f"--policy.device={device}"]
+        # The stored paths are those of before the run or the dataset was moved.
+        places = [f"--output_dir={output}", f"--dataset.root={root}"]
+        arguments = [f"--config_path={settings}", "--resume=true", f"--policy.device={device}", *places]
     else:
         shutil.rmtree(output, ignore_errors=True)  # of a run without a checkpoint
         arguments = [
@@ -133,6 +136,11 @@ def train(config: Config, dataset: str | Path, folder: Path, seed: int, device: 
     if run_script(script, arguments, Path.cwd(), log, threads):
         last = (log.read_text(errors="replace").splitlines() or ["no output"])[-1]
         raise ValueError(f"lerobot-train failed; see {log}, which ends with: {last}")
+    state = output / "checkpoints/last/training_state/training_step.json"
+    if (step := read_json(state, {"step": int})["step"]) != config.steps:
+        raise ValueError(
+            f"the last checkpoint in {output} must be of step {config.steps}, got {step}; see {log}"
+        )
 
 
 def judge(config: Config, folder: Path, device: str) -> None:

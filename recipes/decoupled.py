@@ -98,7 +98,7 @@ def main(config: Config) -> None:
     config = replace(config, world_model=replace(config.world_model, augmentation=augmentation))
     torch.set_num_threads(config.compute.threads)
     with first_rank_first():
-        dataset = find_or_record(config.task, config.dataset, folder)
+        dataset = find_or_record(config.task, config.dataset, folder, config.compute.threads)
     episodes, constants = load_demonstrations(dataset, config.cache)
     if world_model is None:
         seed_everything(config.world_model.seed)

@@ -87,7 +87,7 @@ def main(config: Config) -> None:
         return
 
     with first_rank_first():
-        dataset = find_or_record(config.task, config.dataset, folder)
+        dataset = find_or_record(config.task, config.dataset, folder, config.compute.threads)
     training = replace(config.training, augmentation=augmentation)
     config = replace(config, training=training)
     load = partial(load_demonstrations, dataset, config.cache)

@@ -88,7 +88,7 @@ def main(config: Config) -> None:
         return
 
     torch.set_num_threads(config.compute.threads)
-    dataset = find_or_record(config.task, config.dataset, folder)
+    dataset = find_or_record(config.task, config.dataset, folder, config.compute.threads)
     episodes, constants = load_demonstrations(dataset, config.cache)
     judge = partial(judge_in_closed_loop, task=config.task, settings=config.eval)
     fingerprint = train_policies(

@@ -47,7 +47,8 @@ class Config:
 
 def main(config: Config) -> None:
     """Measure, draw and report."""
-    from dynmap_rl.data.demonstrations import load_dataset, load_meta
+    from dynmap_rl.data.demonstrations import META, load_dataset
+    from dynmap_rl.data.format.reading import find_dataset, read_metadata
     from dynmap_rl.envs.task import BODIES
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.evaluation.open_loop import decodes_poses, open_loop_errors
@@ -83,7 +84,10 @@ def main(config: Config) -> None:
         if decodes_poses(model)
     }
     probes = {name: probe(model, train, test) for name, model in models.items()}
-    rows = [row for row in load_meta(dataset)["episodes"] if row["split"] == "eval"][: len(test)]
+    rows = read_metadata(find_dataset(dataset) / META, {"episodes": [{"split": str, "scene": dict}]})[
+        "episodes"
+    ]
+    rows = [row for row in rows if row["split"] == "eval"][: len(test)]
     read_scene = get_task(task).ranges.scene.from_dict
     judged = {
         "held-out demonstrations": (test, [read_scene(row["scene"]) for row in rows]),

@@ -43,10 +43,10 @@ def make_episodes(count: int = 3, steps: int = 12) -> dict[str, TensorDict]:
     return dict.fromkeys(("train", "eval"), TensorDict(values, [count, steps]))
 
 
-def make_model():
+def make_model(latent_size: int = 16):
     """Return a small world model, always with the same weights."""
     torch.manual_seed(0)
-    return make_world_model(CONSTANTS, ("position",), latent_size=16, hidden_size=24)
+    return make_world_model(CONSTANTS, ("position",), latent_size=latent_size, hidden_size=24)
 
 
 def load():

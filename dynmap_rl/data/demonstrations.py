@@ -186,7 +186,12 @@ def find_meta(root: Path) -> dict | None:
             f"{root} must be a recording of format {FORMAT}, got format {version}; record it again with "
             "recipes/collect.py"
         )
-    return read_metadata(root / META, META_FORM)
+    meta = read_metadata(root / META, META_FORM)
+    if any(len(split) != 2 for split in meta["splits"].values()):
+        raise ValueError(
+            f"{root / META}: splits must each have two numbers, first and end, got {meta['splits']}; restore the file"
+        )
+    return meta
 
 
 def find_layout(meta: dict | None) -> Layout:

@@ -59,8 +59,8 @@ def add_dynamics(
     The columns (float32) are computed for one episode at a time, in float64, with the times of the column ``timestamp``.
     From frames there is also ``dynamics.found`` (bool): whether what an entry belongs to was found in the frame. Other
     positions are interpolated, and trainings leave these entries out. The new folder appears when it is complete. Videos
-    are hard-linked where the file system can; all other files are copied. A recording of a task stays one, and can be
-    trained on with the recipes of the tasks: its constants of normalisation and the names of its dynamics are written anew.
+    and all other files are copied. A recording of a task stays one, and can be trained on with the recipes of the tasks: its
+    constants of normalisation and the names of its dynamics are written anew.
     ``meta/dynamics.json`` has all settings, and the quality of the columns.
 
     Args:
@@ -109,6 +109,8 @@ def add_dynamics(
         raise ValueError(f"--preview must be at least 1 episode, got {preview}")
     root = find_dataset(dataset)
     info, meta = read_info(root), find_meta(root)
+    if replace and preview is not None:
+        raise ValueError("--replace has no effect with --preview; leave it out")
     old = [name for q in DYNAMICS if (name := f"dynamics.{q}") in info["features"]]
     if old and not replace and preview is None:
         raise ValueError(f"{root} must not have {', '.join(old)}; replace them with --replace")

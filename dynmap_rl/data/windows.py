@@ -15,7 +15,7 @@ def sample_windows(
     generator: torch.Generator,
     part: slice = slice(None),
 ) -> TensorDictBase:
-    """Draw windows of episodes; every other window begins at the first step of its episode.
+    """Draw windows of episodes; every other window, or a single one half of the time, begins at its episode's first step.
 
     Args:
         episodes: ``[E, T]``.
@@ -34,7 +34,8 @@ def sample_windows(
     check_length(length, steps)
     episode = integers(0, count, (batch, 1), generator)
     start = integers(0, steps - length + 1, (batch, 1), generator)
-    start[::2] = 0  # where memory is empty, as when control begins, and where most of the motion is
+    first = slice(None, None, 2) if batch > 1 or integers(0, 2, (), generator) else slice(0)
+    start[first] = 0  # where memory is empty, as when control begins, and where most of the motion is
     index = (episode * steps + start + torch.arange(length, device=generator.device))[part]
 
     def select(values: torch.Tensor) -> torch.Tensor:

@@ -77,7 +77,7 @@ class DelayFrames(gym.Wrapper, gym.utils.RecordConstructorArgs):
     Args:
         env: environment whose observations are frames, or dicts with a frame.
         delay: how frames arrive.
-        key: name of the frame in a dict of observations.
+        key: name of the frame in a dict of observations. Observations that are no dict are delayed as a whole.
 
     Raises:
         ValueError: ``delay`` is no :class:`FrameDelay`, or the observations have no ``key``.

@@ -34,7 +34,8 @@ class DelayTransform(Transform):
         delay_key: key of the delays, which is written.
 
     Raises:
-        ValueError: ``delay`` is no :class:`FrameDelay`, or ``seed`` has another number of seeds than there are worlds.
+        ValueError: ``delay`` is no :class:`FrameDelay`, ``seed`` has another number of seeds than there are worlds, or the
+            environment has no ``pixels``.
     """
 
     def __init__(
@@ -126,6 +127,10 @@ class DelayTransform(Transform):
         return tensordict.set(self.out_keys[1], delay.reshape(*batch, self.places))
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        if self.in_keys[0] not in observation_spec.keys(True):
+            raise ValueError(
+                f"{self.in_keys[0]} must be an observation of the environment: make it with from_pixels=True"
+            )
         shape, pixels = observation_spec.shape, observation_spec[self.in_keys[0]]
         if self.bursts:
             frame = pixels.shape[len(shape) :]

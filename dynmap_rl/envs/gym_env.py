@@ -33,7 +33,7 @@ class DynmapEnv(gym.Env):
         ``control="position"``: float32 ``(3,)``, the change dX, dY, dTheta of the commanded cart pose in one step,
         at most 40 mm, 40 mm, 100 mrad (0.8 m/s, 0.8 m/s, 2 rad/s). ``control="acceleration"``: float32 ``(3,)``, the
         acceleration of the cart, at most 6 m/s^2, 6 m/s^2, 20 rad/s^2. In both cases the cart stays within its limits
-        of speed and acceleration and brakes before the edge of the workspace. Actions are in SI units and mean the
+        of speed and acceleration and brakes at the edge of the workspace, to within 2 mm and 7 mrad. Actions are in SI units and mean the
         same in datasets, in TorchRL and here. ``gymnasium.wrappers.RescaleAction`` scales them to -1 to 1, for
         learners that explore with noise of size 1.
 
@@ -111,6 +111,8 @@ class DynmapEnv(gym.Env):
             raise ValueError(f"control must be one of {sorted(ACTION_LIMITS)}, got {control!r}")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be human, rgb_array or None, got {render_mode!r}")
+        if render_size < 1:
+            raise ValueError(f"render_size must be at least 1 pixel, got {render_size}")
         self.task = get_task(task, kind=Task)
         self.task_description = self.task.description
         self.obs_type = obs_type

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey, unravel_key
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import ModelBasedEnvBase
 
@@ -61,9 +62,7 @@ class ImaginationEnv(ModelBasedEnvBase):
         decode_pixels: bool = False,
         reward: Callable[[TensorDictBase], torch.Tensor] | None = None,
     ):
-        size = world_model.latent_size
-        if start.ndim != 1 or start.get("latent", torch.empty(0)).shape != (*start.shape, size):
-            raise ValueError(f"start must be a TensorDict [B] with latent [B, {size}], got {start}")
+        _check_start(start, world_model.latent_size)
         device = next(world_model.parameters()).device  # to which the world model would be moved
         super().__init__(world_model, device=device, batch_size=start.batch_size)
         self.decode_pixels, self.reward_function = decode_pixels, reward
@@ -107,6 +106,7 @@ class ImaginationEnv(ModelBasedEnvBase):
     ) -> TensorDict:
         if not set_state:
             return self.start.clone()
+        _check_start(tensordict, self.world_model.latent_size)
         with torch.no_grad():
             return self._complete(tensordict)
 
@@ -145,15 +145,29 @@ class ImaginationEnv(ModelBasedEnvBase):
         """Do nothing, as nothing is random."""
 
 
-def make_start(world_model: WorldModel, frames: TensorDictBase) -> TensorDictBase:
+def _check_start(start: TensorDictBase | None, size: int) -> None:
+    latent = None if start is None else start.get("latent", None)
+    if latent is None or start.ndim != 1 or latent.shape != (*start.shape, size):
+        found = None if latent is None else tuple(latent.shape)
+        raise ValueError(f"start must be a TensorDict [B] with latent [B, {size}], got latent {found}")
+
+
+def make_start(
+    world_model: WorldModel, frames: TensorDictBase, agent_pos: NestedKey | None = None
+) -> TensorDictBase:
     """Make a start of :class:`ImaginationEnv` from the first frames of episodes, at the last of these frames.
 
     Args:
         world_model: world model that encodes the frames.
-        frames: ``[B, T]``, T >= 1, with ``pixels``, ``action`` (the last one is not used) and optionally ``goal``.
+        frames: ``[B, T]``, T >= 1, with ``pixels``, ``action`` (the last one is not used) and optionally ``goal``. World
+            models read executed actions, as datasets have them; in a rollout, ``action`` is what was wished for.
+        agent_pos: for rollouts, key of the commanded cart pose, whose changes are the executed actions (see
+            :class:`WorldModelTransform`).
 
     Returns:
         TensorDict ``[B]`` with ``latent``, ``predicted_latent``, the memory and the goal.
     """
-    frames = frames.select("pixels", "action", "goal", strict=False)
-    return WorldModelTransform(world_model)(frames).exclude("pixels", "action")[:, -1]
+    poses = [agent_pos, unravel_key(("next", agent_pos))] if agent_pos else []
+    frames = frames.select("pixels", "action", "goal", *poses, strict=False)
+    transform = WorldModelTransform(world_model, agent_pos=agent_pos)
+    return transform(frames).exclude("pixels", "action", *poses)[:, -1]

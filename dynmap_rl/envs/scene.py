@@ -113,6 +113,13 @@ class ObstacleScene(Scene):
     obstacle_y: float = 0.38
     obstacle_length: float = 0.22
 
+    def __post_init__(self):
+        super().__post_init__()
+        if self.obstacle_length < 0.02:
+            raise ValueError(
+                f"obstacle_length of the scene must be at least 0.02 m, its width, got {self.obstacle_length}"
+            )
+
 
 @dataclass(frozen=True)
 class BinScene(Scene):
@@ -135,7 +142,8 @@ class SceneRanges:
         scene: class of the scenes that are drawn. A subclass with more factors has a range for each.
 
     Raises:
-        ValueError: a range is not two finite numbers, the lower one first.
+        ValueError: a range is not two finite numbers, the lower one first, holds impossible factors of a scene, or a least
+            distance or contrast is not a number of at least 0.
     """
 
     cart_width: Range = (0.20, 0.30)
@@ -159,11 +167,23 @@ class SceneRanges:
     def __post_init__(self):
         for name, value in vars(self).items():
             if name.startswith("min_"):
+                if not 0 <= value < math.inf:
+                    raise ValueError(f"{name} of the ranges must be a number of at least 0, got {value!r}")
                 continue
             if np.shape(value) != (2,) or not np.isfinite(value).all() or value[0] > value[1]:
                 raise ValueError(
                     f"{name} of the ranges must be two finite numbers, the lower one first, got {value!r}"
                 )
+        low, high = self._end(0), self._end(1)
+        for factors in (low, high, low | {"block_shift": max(self.block_shift, key=abs)}):
+            self.scene(**factors)  # which raises where a factor is impossible
+
+    def _end(self, end: int) -> dict:
+        """Return the factors at the lower (0) or upper (1) ends of the ranges."""
+        names = {f.name for f in fields(self.scene)} & {f.name for f in fields(self)} - {"background_color"}
+        object_color, background = ((int(r[end]),) * 3 for r in (self.object_color, self.background_color))
+        colors = {"cart_color": object_color, "background_color": background}
+        return {name: getattr(self, name)[end] for name in names} | colors
 
 
 @dataclass(frozen=True)

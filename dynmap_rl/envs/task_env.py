@@ -85,7 +85,7 @@ class TaskEnv(gym.Env):
         return self._observe(), reward, task.is_over(self.world), truncated, self._info()
 
     def render(self) -> np.ndarray | None:
-        """uint8 ``[render_size, render_size, 3]``, or the next smaller multiple of a frame's side."""
+        """uint8 ``[render_size, render_size, 3]``, or the next smaller multiple of a frame's side, at least one."""
         if self.render_mode is None:
             return None
         if self.world is None:

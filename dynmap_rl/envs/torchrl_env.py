@@ -32,7 +32,8 @@ class DynmapBatchedEnv(EnvBase):
     seeds and actions give the same trajectories as the Gymnasium ids, with any ``num_envs``. The environment does not
     reset worlds by itself; as in all of TorchRL, a rollout or a collector does.
 
-    Action: ``action`` float32 ``[N, 3]`` (SI units, see ``control``).
+    Action: ``action`` float32 ``[N, 3]`` (SI units, see ``control``). The action that is executed within the cart's limits
+    is the change of ``agent_pos[..., :3]``.
 
     Observation: ``agent_pos`` ``[N, 5]`` (commanded cart pose x, y, theta and the goal; m, m, rad, m, m), ``goal``
     ``[N, 2]`` (m), ``dropped``, ``touched`` and ``is_success`` bool ``[N, 1]``, ``position_error`` ``[N, 1]`` (m).
@@ -167,7 +168,9 @@ class DynmapBatchedEnv(EnvBase):
         mask = tensordict.get("_step", torch.ones(self.batch_size, dtype=torch.bool))
         rows = mask.reshape(-1).nonzero().flatten().tolist()
         worlds = [self.worlds[i] for i in rows]
-        actions = tensordict["action"].detach().cpu().numpy()[rows]
+        action = tensordict["action"].detach().cpu()
+        # NumPy has no bfloat16.
+        actions = action.to(torch.promote_types(action.dtype, torch.float32)).numpy()[rows]
         if not isinstance(self.task, Task):
             limit = np.array(self.layout.action_limit, np.float32)
             actions = actions.clip(-limit, limit)
@@ -175,7 +178,7 @@ class DynmapBatchedEnv(EnvBase):
             actions = [world.action_for(a) for world, a in zip(worlds, actions, strict=True)]
         self.task.step(worlds, actions)
         self._update(rows)
-        reward = torch.zeros(*self.batch_size, 1)
+        reward = torch.zeros(*self.batch_size, 1, dtype=torch.float32)
         reward[rows] = torch.tensor([[self.task.reward(world)] for world in worlds], dtype=torch.float32)
         return self._observation.clone().set("reward", reward.to(self.device))
 

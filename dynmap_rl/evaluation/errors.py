@@ -14,8 +14,6 @@ from dynmap_rl.modules.actor import STATES
 from dynmap_rl.modules.world_model import WorldModel
 from dynmap_rl.objectives.imitation import imitation_loss
 
-GROUPS = {"": (0, 1), "_angle": (2,)}  # entries of a body's dynamics (x, y, theta) that share a unit
-
 
 def known_dynamics(episodes: TensorDictBase, quantity: str) -> torch.Tensor:
     """Return a quantity of the dynamics ``[E, T, D]``, NaN where ``labelled`` says that it is not known."""
@@ -34,7 +32,8 @@ def prediction_errors(
         episodes: TensorDict ``[E, T]`` with ``pixels``, ``action`` and ``dynamics``; dynamics that ``labelled`` says are
             not known are left out.
         batch: episodes at a time.
-        by_entry: give the error of every entry of the dynamics instead of the means.
+        by_entry: give the error of every entry of the dynamics instead of the means. Without it, the entries must be x, y
+            and angle of each body, or x and y of one or two points.
 
     Returns:
         ``error_rgb``, the root mean square error of the frames (0 to 1), and for every supervised quantity the mean
@@ -54,14 +53,21 @@ def prediction_errors(
             truth = known_dynamics(chunk, name)
             difference, known = (value - truth)[:, 1:].abs(), truth[:, 1:].isfinite()
             size = difference.shape[-1]
-            groups = {g: [i for i in range(size) if i % 3 in entries] for g, entries in GROUPS.items()}
-            for group, entries in ({f"_{i}": [i] for i in range(size)} if by_entry else groups).items():
-                if entries:  # a point has no angle
-                    errors[f"{name}{group}"] = difference[..., entries], known[..., entries]
+            for group, entries in _group_entries(size, by_entry).items():
+                errors[f"{name}{group}"] = difference[..., entries], known[..., entries]
         for name, (value, known) in errors.items():
             sums[f"error_{name}"] += value[known].sum().item()
             counts[f"error_{name}"] += known.sum().item()
     return {name: sums[name] / (counts[name] or torch.nan) for name in counts}
+
+
+def _group_entries(size: int, by_entry: bool) -> dict[str, list[int]]:
+    """Return the entries of a quantity by the ends of their metrics' names: those of a group share a unit."""
+    if by_entry:
+        return {f"_{i}": [i] for i in range(size)}
+    if size % 3:  # points, without an angle
+        return {"": list(range(size))}
+    return {"": [i for i in range(size) if i % 3 < 2], "_angle": list(range(2, size, 3))}
 
 
 def naive_errors(values: torch.Tensor) -> dict[str, list[float]]:

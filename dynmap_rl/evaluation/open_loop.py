@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDictBase
 
 from dynmap_rl.envs.imagination import ImaginationEnv, make_start
-from dynmap_rl.envs.task import BODIES
+from dynmap_rl.envs.task import BODIES, LAYOUT
 from dynmap_rl.modules.world_model import WorldModel
 
 
@@ -34,7 +34,9 @@ def open_loop_errors(
         ValueError: the world model does not decode the poses of cart and block, or the episodes are too short.
     """
     if not decodes_poses(world_model):
-        raise ValueError(f"the world model must be supervised on position, with {len(BODIES)} entries")
+        raise ValueError(
+            f"the world model must be supervised on position, with {len(BODIES)} entries, of cart and block"
+        )
     if horizon < 1:
         raise ValueError(f"horizon must be at least 1, got {horizon}")
     if context < 1 or context + horizon > episodes.shape[1]:
@@ -62,7 +64,10 @@ def open_loop_errors(
 
 def decodes_poses(world_model: WorldModel) -> bool:
     """Return whether a world model decodes the poses of cart and block."""
-    return world_model.sizes.get("position") == len(BODIES)
+    return (world_model.sizes.get("position"), world_model.transition.action.size) == (
+        len(BODIES),
+        len(LAYOUT.action),
+    )
 
 
 def _pose_errors(difference: torch.Tensor) -> torch.Tensor:

@@ -87,7 +87,7 @@ def _latents_and_positions(
     world_model: WorldModel, episodes: TensorDictBase
 ) -> tuple[torch.Tensor, torch.Tensor]:
     latent = compute_features(world_model, episodes)["latent"].flatten(0, 1).double().cpu()
-    position = episodes["dynamics", "position"][..., :2].flatten(0, 1).double()
+    position = episodes["dynamics", "position"][..., :2].flatten(0, 1).double().cpu()
     return torch.nn.functional.pad(latent, (0, 1), value=1.0), position
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import closing, contextmanager, nullcontext
 
 import torch
 from tensordict import TensorDict
@@ -13,7 +13,7 @@ from torchrl.envs.utils import step_mdp
 from tqdm import tqdm
 
 from dynmap_rl.data.recording.plans import Plan, draw_pushes, push
-from dynmap_rl.envs.delay import FrameDelay
+from dynmap_rl.envs.delay import FrameDelay, check_delay
 from dynmap_rl.envs.delay_transform import DelayTransform
 from dynmap_rl.envs.protocol import BaseTask
 from dynmap_rl.envs.task import Task
@@ -61,12 +61,18 @@ def roll_out(
         one-step prediction of the actor's world model at t, zero at t = 0, for each quantity that it decodes.
 
     Raises:
-        ValueError: the actor is of other sizes than the task, or too short a memory for the delay, or the task knows no
-            pushes.
+        ValueError: the actor is of other sizes than the task, has too short a memory for the delay, or takes frames for
+            late without one; ``delay`` is no :class:`FrameDelay`; or the task knows no pushes.
     """
     module = actor if isinstance(actor, nn.Module) else nn.Module()
     seeds, rules, device = [int(seed) for seed in seeds], get_task(task), find_device(actor)
     check_actor(actor, rules)
+    if delay is not None:
+        check_delay(delay)
+    elif isinstance(actor, DelayedActor) and actor.delay:
+        raise ValueError(
+            f"the actor's delay of {actor.delay} steps needs frames with it, such as FrameDelay({actor.delay})"
+        )
     if delay and isinstance(actor, DelayedActor):
         youngest = delay.steps - delay.jitter + delay.error
         if youngest > actor.max_delay:
@@ -80,15 +86,20 @@ def roll_out(
     size = min(len(seeds), rules.max_worlds or len(seeds))
     env = DynmapBatchedEnv(task, size, from_pixels=True, include_state=False, device=device)
     parts, title = [], f"{len(seeds)} episodes" if progress else None
-    for start in range(0, len(seeds), size):
-        some = seeds[start : start + size]
-        full = some + seeds[: size - len(some)]  # a batch always has the same size
-        plans = [Plan(seed, "", pushes=draw_pushes(seed, pushes)) for seed in full]
-        still = reuse_still_frames(module) if device.type == "cpu" else nullcontext()
-        with evaluation_mode(module), still, torch.random.fork_rng([device] if device.type == "cuda" else []):
-            torch.manual_seed(some[0])
-            episodes = _roll_out(actor, env, plans, keep_pixels, delay, title)
-        parts.append(episodes[: len(some)])
+    with closing(env):
+        for start in range(0, len(seeds), size):
+            some = seeds[start : start + size]
+            full = some + seeds[: size - len(some)]  # a batch always has the same size
+            plans = [Plan(seed, "", pushes=draw_pushes(seed, pushes)) for seed in full]
+            still = reuse_still_frames(module) if device.type == "cpu" else nullcontext()
+            with (
+                evaluation_mode(module),
+                still,
+                torch.random.fork_rng([device] if device.type == "cuda" else []),
+            ):
+                torch.manual_seed(some[0])
+                episodes = _roll_out(actor, env, plans, keep_pixels, delay, title)
+            parts.append(episodes[: len(some)])
     return torch.cat(parts)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
@@ -18,8 +17,6 @@ from dynmap_rl.keys import DYNAMICS
 from dynmap_rl.modules.actor import STATES, make_world_model_module
 from dynmap_rl.modules.world_model import WorldModel
 
-matplotlib.use("Agg")
-
 COMPONENTS = ("x", "y", "theta")
 UNITS = {
     "position": ("m", "m", "rad"),
@@ -30,9 +27,10 @@ UNITS = {
 
 @torch.no_grad()
 def predict(world_model: WorldModel, episodes: TensorDictBase) -> TensorDictBase:
-    """Return the episodes ``[E, T]`` with the world model's one-step predictions."""
+    """Return the episodes ``[E, T]`` with the world model's one-step predictions, on the CPU."""
     episodes = episodes.select("pixels", "action", "dynamics", strict=False)
-    return make_world_model_module(world_model)(episodes.clone(False))
+    device = next(world_model.parameters()).device
+    return make_world_model_module(world_model)(episodes.clone(False).to(device)).cpu()
 
 
 def plot_reconstruction(

@@ -18,7 +18,11 @@ from dynmap_rl.utils.settings import flatten
 
 FORMAT = 2  # of config.json; the first release had flat settings
 INPUTS = {"dataset.json", "world_model.json"}  # hashes of what a run has begun with
-UNTRAINED = {".lock", "config.json"} | INPUTS  # files of a run that has failed before its training
+UNTRAINED = {
+    ".lock",
+    "config.json",
+    ".config.json.tmp",
+} | INPUTS  # files of a run that has failed before its training
 
 
 def open_run(folder: Path, config, *, ignore: tuple[str, ...] = ()) -> Path:
@@ -37,17 +41,22 @@ def open_run(folder: Path, config, *, ignore: tuple[str, ...] = ()) -> Path:
         The folder.
 
     Raises:
-        ValueError: the folder holds a run with other settings or of another release, or is in use.
+        ValueError: the folder holds something else than a run, a run with other settings or of another release, or is
+            in use.
     """
     with first_rank_first():
         return _open(Path(folder), config, ignore)
 
 
 def _open(folder: Path, config, ignore: tuple[str, ...]) -> Path:
+    path = folder / "config.json"
     if not rank():
+        if folder.exists() and not path.exists() and {file.name for file in folder.iterdir()} - UNTRAINED:
+            raise ValueError(
+                f"{folder} must be a run or a new folder, got something else; choose another --run"
+            )
         lock_folder(folder)
     settings = {"format": FORMAT, **plain_settings(config)}
-    path = folder / "config.json"
     untrained = {file.name for file in folder.iterdir()} <= UNTRAINED
     begun = path.exists()
     if not begun or (untrained and not rank()):

@@ -22,7 +22,9 @@ LEVEL = 30  # difference of a channel, of 0 to 255
 SHARE = 0.025  # of the pixels, for tasks that are not in the plane: graphics libraries draw edges differently
 
 
-def find_or_record(task: str, dataset: str | Path | None = None, run: Path | None = None) -> str | Path:
+def find_or_record(
+    task: str, dataset: str | Path | None = None, run: Path | None = None, workers: int = 2
+) -> str | Path:
     """Return the dataset to train on.
 
     Args:
@@ -30,6 +32,7 @@ def find_or_record(task: str, dataset: str | Path | None = None, run: Path | Non
         dataset: folder or hub id; by default ``datasets/TASK``, which is recorded with the shipped expert where it is
             missing.
         run: folder of the run that is trained on it, which keeps a hash of the dataset.
+        workers: processes that record.
 
     Raises:
         ValueError: the dataset is of another task, or of the same task with another camera, scene or goal, holds no
@@ -37,7 +40,7 @@ def find_or_record(task: str, dataset: str | Path | None = None, run: Path | Non
     """
     folder = Path("datasets") / get_task(task).name
     if dataset is None and not (folder / META).exists():
-        dataset = record_dataset(folder, task)
+        dataset = record_dataset(folder, task, workers=workers)
     else:
         dataset = folder if dataset is None else dataset
         check_dataset(dataset, task)
@@ -64,11 +67,16 @@ def choose_augmentation(task: BaseTask, augmentation: Augmentation, imitated: bo
     Where a policy learns from the windows too (``imitated``), they are mirrored and shifted in symmetric tasks only.
 
     Raises:
-        ValueError: settings other than the default, and the task is not in the plane.
+        ValueError: settings other than the default, and the task is not in the plane, or a shift of another size than the
+            default, and nothing is shifted.
     """
     if not task.planar and augmentation not in (Augmentation(), Augmentation.off()):
         raise ValueError(f"augmentation has no effect with {task.name}; leave its options out")
     if imitated and not task.symmetric:
+        if augmentation.max_shift not in (Augmentation.max_shift, 0):
+            raise ValueError(
+                f"max_shift has no effect with {task.name}, which is not symmetric; leave it out"
+            )
         augmentation = replace(augmentation, mirror=False, max_shift=0)
     return augmentation if task.planar else Augmentation.off()
 

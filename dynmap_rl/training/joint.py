@@ -16,13 +16,14 @@ from dynmap_rl.modules.checkpoints import load_world_model, make_policy, save_po
 from dynmap_rl.modules.world_model import WorldModel
 from dynmap_rl.objectives.joint import JointLoss
 from dynmap_rl.objectives.world_model import WorldModelLoss
+from dynmap_rl.runs.folder import compare_settings, plain_settings
 from dynmap_rl.utils.devices import Compute, choose_device, seed_everything
-from dynmap_rl.utils.files import write_json
+from dynmap_rl.utils.files import read_json, write_json
 from dynmap_rl.utils.processes import run_processes
 from dynmap_rl.utils.ranks import rank, ranks
 from dynmap_rl.utils.weights import fingerprint
 
-from .decoupled import Judge
+from .decoupled import TRAINED, Judge
 from .loop import SAVE_EVERY, fit
 from .settings import EndToEndTraining, JointTraining, PolicyArchitecture, WorldModelArchitecture
 from .world_model import build_world_model, make_loss
@@ -170,9 +171,14 @@ def train_seeds(
         The first seed's world model; None in all but the first of several processes that train together.
 
     Raises:
+        ValueError: ``folder`` has seeds that were trained with other settings.
         OSError: a process died.
     """
     compute, folder = compute or Compute(), Path(folder)
+    form = _name_settings(world_model, policy, settings)
+    for path in (folder / f"seed_{seed}" / TRAINED for seed in seeds):
+        if path.exists() and _differs(read_json(path), form):
+            raise ValueError(f"{path.parent} was trained with other settings; choose another folder")
     todo = [seed for seed in seeds if not (folder / f"seed_{seed}" / "eval.json").exists()]
     threads = compute.threads if len(seeds) == 1 or ranks() > 1 else 1
     work = _Work(
@@ -186,6 +192,14 @@ def train_seeds(
     first = load_world_model(folder / f"seed_{seeds[0]}" / "world_model")
     save_world_model(folder / "world_model", first)
     return first
+
+
+def _name_settings(world_model, policy, settings) -> dict:
+    return {"world_model": world_model, "policy": policy, type(settings).__name__: settings}
+
+
+def _differs(stored: dict, form: dict) -> bool:
+    return set(stored) != set(form) or any(compare_settings(stored[name], form[name]) for name in form)
 
 
 def _train_and_evaluate(arguments: tuple[_Work, int]) -> None:
@@ -208,6 +222,8 @@ def _train_and_evaluate(arguments: tuple[_Work, int]) -> None:
     world_model.eval(), policy.eval()
     save_world_model(folder / "world_model", world_model)
     save_policy(folder / "policy", policy, world_model)
+    form = _name_settings(work.world_model, work.policy, work.settings)
+    write_json(folder / TRAINED, {name: plain_settings(value) for name, value in form.items()})
     torch.set_num_threads(1)
     result = work.judge(world_model, policy)
     write_json(folder / "eval.json", result | {"world_model_sha256": fingerprint(world_model)})

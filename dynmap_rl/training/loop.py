@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -62,7 +63,7 @@ def fit(
 
     Raises:
         ValueError: the loss is not finite or diverges, a batch cannot be divided among the processes, or the folder
-            holds a training with other settings; the last training state is kept.
+            holds a training with other settings, of another model or on other data; the last training state is kept.
         OSError: another process has ended.
     """
     for update in (0, settings.updates - 1):
@@ -80,6 +81,7 @@ def fit(
         *("pixels", "action", "goal", "dynamics", "disturbed", "expert_action", "labelled", "step_count"),
         strict=False,
     )
+    data = _hash_labels(episodes)
     if device.type == "cuda" and episodes.bytes() < torch.cuda.mem_get_info(device)[0] / 2:
         episodes = episodes.to(device)  # larger ones stay on disk
     generator = torch.Generator(device).manual_seed(1000 * seed)
@@ -95,7 +97,12 @@ def fit(
         stored = flatten(plain_settings(type(one)())) | flatten(state.get("form", form))
         if stored != flatten(form) or state["update"] > settings.updates:
             raise ValueError(f"{folder} holds a training with other settings; choose another folder")
-        model.load_state_dict(state["model"])
+        if state.get("data", data) != data:
+            raise ValueError(f"{folder} holds a training on other episodes; choose another folder")
+        try:
+            model.load_state_dict(state["model"])
+        except RuntimeError as error:
+            raise ValueError(f"{folder} holds a training of another model; choose another folder") from error
         optimizer.load_state_dict(state["optimizer"])
         start, first = state["update"], state["first_loss"]
         _restore(generator, state["generator"], start)
@@ -132,7 +139,16 @@ def fit(
                 update=done,
                 first_loss=first,
                 form=form,
+                data=data,
             )
+
+
+def _hash_labels(episodes: TensorDictBase) -> str:
+    """Return a hash of actions and dynamics, which are small and tell sources of dynamics apart."""
+    digest = hashlib.sha256()
+    for key in sorted(episodes.select("action", "dynamics", strict=False).keys(True, True), key=str):
+        digest.update(episodes[key].cpu().numpy().tobytes())
+    return digest.hexdigest()[:16]
 
 
 class _Losses(nn.Module):

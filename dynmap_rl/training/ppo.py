@@ -6,6 +6,7 @@ import pickle
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -21,7 +22,13 @@ from tqdm import tqdm
 
 from dynmap_rl.envs.world import EPISODE_STEPS
 from dynmap_rl.experts.network import ExpertNetwork, make_actor
-from dynmap_rl.runs.folder import load_training_state, save_training_state, truncate_metrics
+from dynmap_rl.runs.folder import (
+    compare_settings,
+    load_training_state,
+    plain_settings,
+    save_training_state,
+    truncate_metrics,
+)
 from dynmap_rl.runs.loggers import log_metrics
 from dynmap_rl.utils.devices import seed_everything
 from dynmap_rl.utils.files import write_json
@@ -68,8 +75,8 @@ def train_ppo(
         logger: ``tensorboard``, ``wandb``, ``trackio`` or None.
 
     Raises:
-        ValueError: the loss is not finite, or the training state is of an earlier release or of more iterations; the
-            state is kept.
+        ValueError: the loss is not finite, or the training state is of an earlier release, of other settings or of
+            more iterations; the state is kept.
         OSError: a process died.
     """
     folder = Path(folder)
@@ -97,6 +104,7 @@ def train_ppo(
     optimizer = torch.optim.Adam(networks.parameters(), settings.learning_rate, eps=1e-5, fused=True)
 
     start, seconds = 0, 0.0
+    form = replace(settings, iterations=1)  # a training may go on for more
     state_path = folder / "checkpoint" / "training_state.pt"
     if state := load_training_state(state_path):
         if "networks" not in state:
@@ -104,6 +112,8 @@ def train_ppo(
         networks.load_state_dict(state["networks"])
         optimizer.load_state_dict(state["optimizer"])
         start, seconds = state["iteration"], state["seconds"]
+        if compare_settings(state.get("form", plain_settings(form)), form):
+            raise ValueError(f"{state_path} is of a training with other settings; choose another --run")
         if start > settings.iterations:
             raise ValueError(
                 f"PPOTraining.iterations must be at least the {start} of {state_path}, got {settings.iterations}"
@@ -148,6 +158,7 @@ def train_ppo(
                 optimizer=optimizer.state_dict(),
                 iteration=iteration + 1,
                 seconds=seconds,
+                form=plain_settings(form),
             )
 
 

@@ -25,11 +25,13 @@ class WorldModelArchitecture:
     def __post_init__(self):
         check_choice(self, "architecture", ("glimpse", "plain", "resnet18", "resnet18_imagenet", "vit"))
         names = [name.strip() for name in self.supervision.split(",")]
+        ordered = ",".join(name for name in DYNAMICS if name in names)  # one name for each set
         if names != ["none"] and (len(set(names)) < len(names) or not set(names) <= set(DYNAMICS)):
             raise ValueError(
                 f"{type(self).__name__}.supervision must be any of {', '.join(DYNAMICS)} with commas between, or "
                 f"none, got {self.supervision!r}"
             )
+        object.__setattr__(self, "supervision", ordered or "none")
 
 
 @dataclass(frozen=True)

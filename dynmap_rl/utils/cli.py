@@ -51,6 +51,7 @@ def run_recipe(
     """
     # Large pages for torch's memory: small ones cost a fifth of a world model's training.
     os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
+    os.environ.setdefault("MPLBACKEND", "Agg")  # figures are written, never shown
     sys.path.append(os.getcwd())  # a task named module:Class may lie here
     given = ["--help" if argument == "-h" else argument for argument in argv[1:] if argument != "--debug"]
     debug = len(given) < len(argv) - 1

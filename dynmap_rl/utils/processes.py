@@ -19,7 +19,8 @@ def run_processes(stages: Sequence[Callable[[tuple], None]], arguments: list[tup
     """Run every stage on each argument, ``count`` at a time, each in a process of its own.
 
     A stage begins when the stage before it is done for its argument and the first stages of all arguments have
-    started. With one process or one argument, everything runs in this process.
+    started. With one process or one argument, everything runs in this process, whose number of torch's threads is
+    restored.
 
     Args:
         stages: functions of one argument, in order.
@@ -30,9 +31,15 @@ def run_processes(stages: Sequence[Callable[[tuple], None]], arguments: list[tup
         OSError: a process died.
     """
     if min(count, len(arguments)) <= 1:
-        for one in arguments:
-            for stage in stages:
-                stage(one)
+        import torch
+
+        threads = torch.get_num_threads()
+        try:
+            for one in arguments:
+                for stage in stages:
+                    stage(one)
+        finally:
+            torch.set_num_threads(threads)
         return
     with open_pool(count, "the same command resumes") as pool:
         running = {pool.submit(stages[0], one): (one, stages[1:]) for one in arguments}

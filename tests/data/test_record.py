@@ -182,3 +182,17 @@ def test_a_full_disk_or_a_lost_worker_is_one_clear_error(tmp_path, monkeypatch, 
     monkeypatch.setattr(module, "record_shard", fail)
     with pytest.raises(OSError, match="[Tt]he same call|repeat the call"):
         record_dataset(tmp_path / "d", episodes=1, eval_episodes=1, workers=1)
+
+
+def test_an_expert_that_reads_other_states_is_refused(tmp_path):
+    """The states of tasks 2 and 3 have the same number of entries."""
+    for task, expert in (("bin_dropping", "balance_reaching_obstacle"), ("balance_reaching", "bin_dropping")):
+        with pytest.raises(ValueError, match=f"expert {expert} reads states of {expert}, which {task}"):
+            record_dataset(tmp_path / "d", task, "exploration", 2, 1, expert=expert)
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_expert_of_task_1_is_recorded_in_the_scenes_of_the_others(tmp_path):
+    settings = {"episodes": 1, "eval_episodes": 1, "workers": 1, "expert": "balance_reaching"}
+    root = record_dataset(tmp_path / "d", "bin_dropping", "exploration", **settings)
+    assert load_dataset(root).shape == (2, 120)

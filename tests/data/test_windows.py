@@ -29,3 +29,10 @@ def test_every_start_is_drawn_and_a_part_is_that_of_the_whole_batch():
     )
     assert set(whole[:, 0].tolist()) == {0, 1, 2}
     assert torch.equal(part, whole[1::2])
+
+
+def test_single_windows_begin_everywhere():
+    episodes, generator = TensorDict({"t": torch.arange(20).expand(5, 20)}, [5, 20]), torch.Generator()
+    starts = torch.cat([sample_windows(episodes, 1, 7, generator)["t"][:, 0] for _ in range(400)])
+    assert set(starts.tolist()) == set(range(14))
+    assert 0.4 < (starts == 0).float().mean() < 0.7

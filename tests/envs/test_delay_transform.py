@@ -187,3 +187,8 @@ def test_an_environment_without_batch_dimensions_is_one_world():
     frames = late.rollout(5)
     assert frames["delay"].flatten().tolist() == [0, 1, 2, 2, 2]
     assert frames["pixels"].shape == (5, 64, 64, 3) and torch.equal(frames["pixels"][1], frames["pixels"][0])
+
+
+def test_an_environment_without_frames_is_refused():
+    with pytest.raises(ValueError, match="from_pixels=True"):
+        TransformedEnv(DynmapBatchedEnv(), DelayTransform(FrameDelay(6))).rollout(2)

@@ -176,6 +176,8 @@ def test_vector_environment_equals_single_ones(task):
 def test_unknown_argument_raises(name):
     with pytest.raises(ValueError, match=f"{name} .*'nope'"):
         DynmapEnv(**{name: "nope"})
+    with pytest.raises(ValueError, match="render_size must be at least 1 pixel, got 0"):
+        DynmapEnv(render_size=0)
 
 
 @pytest.mark.parametrize("control", ["position", "acceleration"])

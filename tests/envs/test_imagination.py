@@ -50,6 +50,15 @@ def test_the_start_is_where_the_world_model_is_after_the_frames(frames):
     assert all((first[key] == 0).all() for key in ("predicted_latent", *MEMORY))
 
 
+def test_the_executed_actions_of_a_rollout_are_read():
+    episodes = DynmapBatchedEnv(num_envs=2, from_pixels=True, seed=0).rollout(5)
+    executed = (episodes["next", "agent_pos"] - episodes["agent_pos"])[..., :3]
+    assert (executed - episodes["action"]).abs().max() > 0.01
+    expected = make_start(make_model(), episodes.clone().set("action", executed))
+    start = make_start(make_model(), episodes, agent_pos="agent_pos")
+    assert set(start.keys()) == set(expected.keys()) and (start == expected).all()
+
+
 def reward(td):
     return -(td["predicted_dynamics", "position"][:, :2] - td["goal"]).norm(dim=-1, keepdim=True)
 
@@ -165,10 +174,16 @@ def test_a_reward_s_gradient_reaches_the_policy_through_the_steps(frames):
     assert all(p.grad.abs().sum() > 0 for p in actor.policy.parameters())
 
 
-def test_a_start_of_another_form_is_refused():
+def test_a_start_of_another_form_is_refused(frames):
+    message = r"start must be a TensorDict \[B\] with latent \[B, 16\]"
+    env = ImaginationEnv(make_model(), make_start(make_model(), frames))
     for start in (TensorDict({}, [B]), TensorDict({"latent": torch.zeros(B, 9)}, [B])):
-        with pytest.raises(ValueError, match=r"start must be a TensorDict \[B\] with latent \[B, 16\]"):
+        with pytest.raises(ValueError, match=message):
             ImaginationEnv(make_model(), start)
+        with pytest.raises(ValueError, match=message):
+            env.reset(start, set_state=True)
+    with pytest.raises(ValueError, match=message):
+        env.reset(set_state=True)
 
 
 @torch.no_grad()

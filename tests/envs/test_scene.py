@@ -119,6 +119,25 @@ def test_a_range_is_two_numbers(ranges):
         SceneRanges(**ranges)
 
 
+@pytest.mark.parametrize(
+    ("kind", "ranges"),
+    [
+        (SceneRanges, {"block_shift": (-0.1, 0.09)}),  # of a cart that is at least 0.2 m wide
+        (SceneRanges, {"block_shift": (-0.05, 0.15)}),
+        (SceneRanges, {"goal_x": (0.5, 1.2)}),
+        (SceneRanges, {"block_width": (0.0, 0.1)}),
+        (SceneRanges, {"background_color": (180, 300)}),
+        (SceneRanges, {"min_distance": -1.0}),
+        (SceneRanges, {"min_contrast": math.nan}),
+        (ObstacleRanges, {"obstacle_length": (0.01, 0.2)}),
+    ],
+)
+def test_ranges_that_hold_impossible_scenes_are_refused(kind, ranges):
+    kind()
+    with pytest.raises(ValueError, match=next(iter(ranges))):
+        kind(**({"cart_width": (0.19, 0.3)} | ranges))
+
+
 def test_splits_never_share_a_seed():
     ends = sorted((scene_seed(s, 0), scene_seed(s, SEEDS_PER_SPLIT - 1)) for s in SPLITS)
     assert all(last < first for (_, last), (first, _) in pairwise(ends))
@@ -156,6 +175,7 @@ def test_unknown_factor_raises():
         (Scene, {"density": -1.0}),
         (Scene, {"block_shift": 0.2}),
         (ObstacleScene, {"obstacle_length": 0.0}),
+        (ObstacleScene, {"obstacle_length": 0.01}),
         (BinScene, {"bin_width": -0.1}),
         (BinScene, {"bin_depth": 0.0}),
     ],

@@ -56,6 +56,17 @@ def test_specs(task, arguments):
     check_env_specs(env, seed=0)
 
 
+def test_other_dtypes_than_float32():
+    torch.set_default_dtype(torch.float64)
+    try:
+        check_env_specs(DynmapBatchedEnv(num_envs=2), seed=0)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    env = DynmapBatchedEnv(num_envs=2, seed=0)
+    td = env.step(env.reset().set("action", torch.full((2, 3), 0.01, dtype=torch.bfloat16)))
+    assert (td["next", "agent_pos"] - td["agent_pos"])[:, 0] == pytest.approx([0.01] * 2, rel=0.5)
+
+
 def test_without_the_state_nothing_privileged_is_observed():
     env = DynmapBatchedEnv(num_envs=2, from_pixels=True, include_state=False, seed=0)
     rollout = env.rollout(3)

@@ -8,7 +8,7 @@ from small import CONSTANTS, load, make_episodes, make_model
 
 from dynmap_rl.data.features import compute_features
 from dynmap_rl.evaluation.errors import judge_held_out, policy_errors, prediction_errors
-from dynmap_rl.modules.checkpoints import make_policy
+from dynmap_rl.modules.checkpoints import make_policy, make_world_model
 from dynmap_rl.objectives.imitation import ImitationLoss
 
 
@@ -35,6 +35,18 @@ def test_prediction_errors_are_means_over_steps_with_a_prediction(episodes):
     by_entry = prediction_errors(model, episodes, batch=2, by_entry=True)
     entries = [by_entry[f"error_position_{i}"] for i in range(6)]
     torch.testing.assert_close(torch.tensor(entries), error, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("size", [2, 4])
+def test_points_have_no_angle(episodes, size):
+    constants = CONSTANTS | {"position": {"low": [0.0] * size, "high": [1.0] * size}}
+    model = make_world_model(constants, ("position",), latent_size=16, hidden_size=24).eval()
+    points = episodes.clone()
+    points["dynamics", "position"] = episodes["dynamics", "position"][..., :size]
+    found, by_entry = (prediction_errors(model, points, by_entry=by_entry) for by_entry in (False, True))
+    assert set(found) == {"error_rgb", "error_position"}
+    entries = [by_entry[f"error_position_{i}"] for i in range(size)]
+    assert found["error_position"] == pytest.approx(sum(entries) / size, rel=1e-5)
 
 
 def test_dynamics_that_were_not_found_are_left_out(episodes):

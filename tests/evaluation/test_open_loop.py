@@ -77,3 +77,11 @@ def test_open_loop_errors_on_demonstrations(recording):
             open_loop_errors(model, episodes)
     with pytest.raises(ValueError, match=r"120, got 100 \+ 40"):
         open_loop_errors(make_model(), episodes, context=100)
+
+
+def test_a_world_model_of_other_bodies_is_refused():
+    """Puck and hand in three dimensions have six entries too."""
+    action = {"low": [-1.0] * 4, "high": [1.0] * 4}
+    model = make_world_model(CONSTANTS | {"action": action}, ("position",), latent_size=16, hidden_size=24)
+    with pytest.raises(ValueError, match="position, with 6 entries, of cart and block"):
+        open_loop_errors(model, TensorDict({}, [1, 20]), context=2, horizon=2)

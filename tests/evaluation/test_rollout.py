@@ -177,6 +177,10 @@ def test_an_actor_may_have_keys_of_its_own():
 def test_an_actor_that_would_use_no_frame_is_refused():
     with pytest.raises(ValueError, match="max_delay of the actor must be at least 6"):
         roll_out(DelayedActor(make_actor(), max_delay=5), "balance_reaching", [0], delay=FrameDelay(7, 1))
+    with pytest.raises(ValueError, match=r"such as FrameDelay\(5\)"):
+        roll_out(DelayedActor(make_actor(), delay=5), "balance_reaching", [0])
+    with pytest.raises(ValueError, match="delay must be a FrameDelay"):
+        roll_out(DelayedActor(make_actor(), max_delay=6), "balance_reaching", [0], delay=6)
 
 
 def test_pushes_act_on_the_cart_but_the_actor_is_not_told():

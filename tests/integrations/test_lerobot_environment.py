@@ -89,7 +89,16 @@ def test_seeds_count_within_the_test_split():
 
 
 @pytest.mark.parametrize(
-    ("field", "value"), [("task", "chess"), ("fps", 30), ("episode_length", 60), ("split", "dev")]
+    ("field", "value"),
+    [
+        ("task", "chess"),
+        ("task", None),
+        ("fps", 30),
+        ("episode_length", 60),
+        ("split", "dev"),
+        ("render_size", 255),
+        ("render_size", 0),
+    ],
 )
 def test_env_config_refuses_other_values(field, value):
     with pytest.raises(ValueError, match=str(value)):

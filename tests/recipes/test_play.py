@@ -98,7 +98,7 @@ def test_episodes_of_a_person_become_a_dataset(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_later_episodes_are_added_to_a_dataset_of_ones_own_task(tmp_path, monkeypatch):
+def test_later_episodes_are_added_to_a_dataset_of_ones_own_task(recording, tmp_path, monkeypatch):
     (tmp_path / "other_tasks.py").write_text(
         "from dynmap_rl.envs.tasks import BalanceReaching\n"
         "class Nearer(BalanceReaching):\n"
@@ -127,6 +127,9 @@ def test_later_episodes_are_added_to_a_dataset_of_ones_own_task(tmp_path, monkey
 
     other = run(tmp_path, "play", "--task", "bin_dropping", "--record", "mine")
     assert other.returncode == 2 and TASK in other.stderr and "bin_dropping" in other.stderr
+    shutil.copytree(recording, tmp_path / "recorded")
+    other = run(tmp_path, "play", "--record", "recorded")
+    assert other.returncode == 2 and "kind human" in other.stderr and "demonstrations" in other.stderr
     shutil.rmtree(tmp_path / "mine.parts/0001")
     lost = run(tmp_path, "play", "--task", TASK, "--record", "mine", "--steps", 1)
     assert lost.returncode == 2 and "mine.parts" in lost.stderr

@@ -61,7 +61,16 @@ def test_a_run_that_has_not_begun_to_train_may_get_other_settings(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {".lock", "config.json"}
 
 
-def test_files_in_a_folder_that_is_no_run_are_kept(tmp_path):
+def test_a_folder_that_is_no_run_is_left_alone(tmp_path):
+    append_metrics(tmp_path, 1, loss=0.5)
+    write_json(tmp_path / "eval.json", {"of": "somebody"})
+    before = {path.name: path.read_text() for path in tmp_path.iterdir()}
+    with pytest.raises(ValueError, match="run or a new folder.*--run"):
+        open_run(tmp_path, Settings())
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == before
+
+
+def test_a_file_of_a_runs_inputs_in_a_folder_without_settings_is_kept(tmp_path):
     write_json(tmp_path / "dataset.json", {"of": "somebody"})
     open_run(tmp_path, Settings())
     assert read_json(tmp_path / "dataset.json") == {"of": "somebody"}

@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dynmap_rl.data.settings import Augmentation
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.training import dataset
-from dynmap_rl.training.dataset import check_dataset, check_start, find_or_record
+from dynmap_rl.training.dataset import check_dataset, check_start, choose_augmentation, find_or_record
 from dynmap_rl.utils.files import read_json, write_json
 
 TASK = "balance_reaching"
@@ -30,7 +31,7 @@ def test_an_existing_dataset_is_taken(recording, tmp_path, monkeypatch):
 
 def test_a_missing_default_dataset_is_recorded(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(dataset, "record_dataset", lambda *arguments: arguments)
+    monkeypatch.setattr(dataset, "record_dataset", lambda *arguments, workers: arguments)
     assert find_or_record(TASK) == (Path("datasets") / TASK, TASK)
     with pytest.raises(ValueError, match="datasets/none"):
         find_or_record(TASK, "datasets/none")
@@ -86,3 +87,11 @@ def test_a_run_keeps_a_hash_of_its_data(recording, tmp_path):
     info.write_text(info.read_text() + " ")
     with pytest.raises(ValueError, match="other data than"):
         find_or_record("balance_reaching", root, run)
+
+
+def test_a_shift_without_effect_is_refused():
+    task = get_task("bin_dropping")
+    assert choose_augmentation(task, Augmentation(), imitated=True).max_shift == 0
+    assert choose_augmentation(task, Augmentation(max_shift=3)).max_shift == 3
+    with pytest.raises(ValueError, match="max_shift has no effect with bin_dropping"):
+        choose_augmentation(task, Augmentation(max_shift=3), imitated=True)

@@ -1,5 +1,7 @@
 """Joint and end-to-end training: what learns, and that threads and kills change no weight."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from small import CONSTANTS, END_TO_END, JOINT, Stop, judge, load, make_episodes, make_model, read_weights
@@ -95,3 +97,10 @@ def test_a_finished_seed_is_left_alone(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "fit", None)
     train(tmp_path)
     assert read_weights(tmp_path) == weights
+
+
+def test_a_seed_of_other_settings_is_refused(tmp_path):
+    train(tmp_path)
+    for settings in (replace(JOINT, beta_z=0.9), END_TO_END):
+        with pytest.raises(ValueError, match="seed_0 was trained with other settings"):
+            train(tmp_path, settings)

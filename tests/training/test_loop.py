@@ -50,6 +50,18 @@ def test_a_folder_with_a_training_of_other_settings_is_refused(tmp_path):
             train_world_model(make_model(), make_episodes(), tmp_path, replace(WORLD_MODEL, **change))
 
 
+def test_a_folder_with_a_training_of_another_model_or_other_data_is_refused(tmp_path):
+    train_world_model(make_model(), make_episodes(), tmp_path, WORLD_MODEL)
+    with pytest.raises(ValueError, match="another model"):
+        train_world_model(make_model(latent_size=12), make_episodes(), tmp_path, WORLD_MODEL)
+    for key in ("action", ("dynamics", "position")):
+        episodes = make_episodes()
+        episodes["train"] = episodes["train"].clone()
+        episodes["train"][key] = episodes["train"][key] + 0.1
+        with pytest.raises(ValueError, match="other episodes"):
+            train_world_model(make_model(), episodes, tmp_path, WORLD_MODEL)
+
+
 def test_a_training_that_is_older_than_a_setting_has_its_default(tmp_path):
     train_world_model(make_model(), make_episodes(), tmp_path, WORLD_MODEL)
     path = tmp_path / "checkpoint/world_model.pt"

@@ -115,6 +115,13 @@ def test_a_state_of_an_earlier_release_is_refused(tmp_path):
         train(tmp_path)
 
 
+def test_a_state_of_other_settings_is_refused(tmp_path):
+    small = replace(SETTINGS, iterations=1)
+    train(tmp_path, small)
+    with pytest.raises(ValueError, match="other settings; choose another --run"):
+        train(tmp_path, replace(small, iterations=2, gamma=0.5))
+
+
 def test_a_loss_that_is_not_finite_keeps_the_last_state(tmp_path, monkeypatch):
     whole, calls = ppo.update, []
 

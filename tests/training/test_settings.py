@@ -78,3 +78,10 @@ def test_torch_is_not_imported():
         "WorldModelTraining(), Evaluation(); print('torch' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "False\n"
+
+
+def test_a_supervision_has_one_name():
+    for name in ("velocity,position", " position, velocity"):
+        assert WorldModelTraining(supervision=name) == WorldModelTraining(supervision="position,velocity")
+    with pytest.raises(ValueError, match="nothing would be learned"):
+        WorldModelTraining(supervision=" none", beta_rgb=0.0)

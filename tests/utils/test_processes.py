@@ -5,6 +5,7 @@ import os
 import sys
 
 import pytest
+import torch
 
 from dynmap_rl.utils.processes import map_processes, run_processes, run_script
 
@@ -100,3 +101,9 @@ def test_a_script_has_the_number_of_threads(tmp_path):
     for threads in 1, 2:
         assert run_script(tmp_path / "script.py", [], tmp_path, tmp_path / "log", threads) == 0
     assert (tmp_path / "log").read_text().split() == ["1", "2"]
+
+
+def test_work_in_this_process_leaves_the_number_of_threads():
+    before = torch.get_num_threads()
+    run_processes([torch.set_num_threads], [before + 1], 1)
+    assert torch.get_num_threads() == before

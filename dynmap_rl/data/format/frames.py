@@ -82,7 +82,8 @@ def iterate_frames(
     video = info["features"][camera]["dtype"] == "video"
     episodes = _read_episodes(root, camera) if video else {}
     columns = ["episode_index", "index", "timestamp", *([] if video else [camera])]
-    largest = math.prod(info["features"][camera]["shape"])
+    shape = info["features"][camera]["shape"]
+    largest = math.prod(shape) // min(shape)  # pixels, without the channels
     for file in sorted((root / "data").glob("*/*.parquet")):
         if only is not None and not set(only) & set(
             read_file(file, columns[:1])["episode_index"].to_pylist()

@@ -96,15 +96,15 @@ def open_folder(root: str | Path, task: str) -> None:
         )
     elif path.exists():
         stored = read_json(path)
-    if (root / META).exists() and len(list_shards(root, task)) < (there := len(stored["episodes"])):
-        raise ValueError(
-            f"{parts_folder(root)} must hold the {there} episodes of {root}, to merge them with new ones, got fewer; choose "
-            "another folder"
-        )
     if any(stored.get(name) != value for name, value in settings.items()):
         raise ValueError(
             f"{root} must be a recording of kind {KIND} of {task}, got {stored.get('kind')} of {stored.get('task')}; "
             "choose another folder"
+        )
+    if (root / META).exists() and len(list_shards(root, task)) < (there := len(stored["episodes"])):
+        raise ValueError(
+            f"{parts_folder(root)} must hold the {there} episodes of {root}, to merge them with new ones, got fewer; choose "
+            "another folder"
         )
     lock_folder(parts_folder(root))
     write_json(path, settings)

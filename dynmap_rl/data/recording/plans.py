@@ -14,7 +14,7 @@ from dynmap_rl.envs.task import Task
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.envs.world import EPISODE_STEPS, LARGEST_CHANGE, World, limit_actions
-from dynmap_rl.experts.network import list_checkpoints, load_expert
+from dynmap_rl.experts.network import list_checkpoints, load_expert, task_of_expert
 
 from .demonstrators import demonstrate
 
@@ -142,15 +142,16 @@ def run_plans(task: str, plans: list[Plan], expert: str | Path | None = None) ->
     n = len(plans)
     env = DynmapBatchedEnv(task, n, from_pixels=True)
     td = env.reset(TensorDict({"scene_seed": torch.tensor([p.scene_seed for p in plans])}, [n]))
+    rules = task_of_expert(expert or task, env.task)
     networks = {name: load_expert(expert or task, name) for name in sorted({p.checkpoint for p in plans})}
     rngs = [np.random.default_rng([p.scene_seed, 1]) for p in plans]
     detours = _detour_goals(plans, rngs)
     steps = []
     for t in range(EPISODE_STEPS):
-        state = td["state"].clone()
+        state = np.stack([rules.state(world) for world in env.worlds])
         for row in np.flatnonzero(~np.isnan(detours[:, t, 0])):
-            state[row] = torch.from_numpy(_state_for(env.task, env.worlds[row], detours[row, t]))
-        acceleration = _expert_acceleration(state, plans, networks)
+            state[row] = _state_for(rules, env.worlds[row], detours[row, t])
+        acceleration = _expert_acceleration(torch.from_numpy(state), plans, networks)
         action = np.stack([w.action_for(a) for w, a in zip(env.worlds, acceleration, strict=True)])
         expert_action = limit_actions(env.worlds, action)
         _add_noise(action, plans, rngs)

@@ -13,6 +13,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from dynmap_rl.envs.tasks import get_task
+from dynmap_rl.experts.network import find_expert, task_of_expert
 from dynmap_rl.utils.cluster import check_launcher, run_by_ray
 from dynmap_rl.utils.files import read_json, write_json
 from dynmap_rl.utils.processes import open_pool, share
@@ -53,8 +54,8 @@ def record_dataset(
         The folder of the dataset.
 
     Raises:
-        ValueError: an argument is wrong, the folder holds something else or is being recorded to, or too few episodes
-            succeed.
+        ValueError: an argument is wrong, the expert is of another task, the folder holds something else or is being
+            recorded to, or too few episodes succeed.
         OSError: the folder cannot be written, or a worker died. Finished shards are kept.
     """
     from filelock import FileLock, Timeout
@@ -92,7 +93,7 @@ def record_dataset(
 
 
 def _check_settings(root: Path, settings: dict) -> None:
-    get_task(settings["task"])
+    task = get_task(settings["task"])
     find_checkpoints(settings["task"], settings["expert"])
     if settings["kind"] not in KINDS:
         raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {settings['kind']!r}")
@@ -108,6 +109,8 @@ def _check_settings(root: Path, settings: dict) -> None:
         )
         where = root if (root / META).exists() else parts_folder(root)
         raise ValueError(f"{where} holds another recording ({changed}); choose another folder or delete it")
+    if not task.has_demonstrator:
+        task_of_expert(settings["expert"], task)
 
 
 def _stored_settings(root: Path) -> dict | None:
@@ -147,11 +150,14 @@ def _record(root: Path, parts: Path, settings: dict, workers: int, launcher: str
 
 
 def _plan_shards(parts: Path, settings: dict) -> list[Shard]:
+    expert = settings["expert"]
+    if (path := find_expert(expert)) == Path(expert).expanduser() and path.is_dir():
+        expert = str(path.absolute())
     return [
         Shard(
             folder=parts / f"{split}_{number:04d}",
             task=settings["task"],
-            expert=settings["expert"],
+            expert=expert,
             kind=settings["kind"],
             split=split,
             number=number,

@@ -40,7 +40,7 @@ class DynmapEnvConfig(EnvConfig):
         lost: probability that a frame is lost.
 
     Raises:
-        ValueError: task or split is unknown, length or rate differ, or delays are impossible.
+        ValueError: task or split is unknown, length or rate differ, the size is odd, or delays are impossible.
     """
 
     task: str | None = "balance_reaching"
@@ -55,6 +55,10 @@ class DynmapEnvConfig(EnvConfig):
     def __post_init__(self):
         if (here := os.getcwd()) not in sys.path:  # LeRobot's commands do not look here for module:Class
             sys.path.append(here)
+        if self.task is None:
+            raise ValueError("--env.task must be the name of a task, got None")
+        if self.render_size < 2 or self.render_size % 2:
+            raise ValueError(f"--env.render_size must be an even number of pixels, got {self.render_size}")
         layout = get_task(self.task).layout
         scene_seed(self.split, 0)
         FrameDelay(self.delay, self.jitter, self.lost)
