@@ -157,10 +157,10 @@ def read_motion(
         except ValueError as error:
             failed.setdefault(str(error), []).append(episode)
     if failed:
-        raise ValueError(
-            f"{root}: {'; '.join(f'in {_name_episodes(e)} {text}' for text, e in failed.items())}; or delete these "
-            "episodes (lerobot-edit-dataset)"
-        )
+        found = "; ".join(f"in {_name_episodes(e)} {text}" for text, e in failed.items())
+        some = sum(map(len, failed.values())) < (len(rows) if only is None else len(only))
+        advice = "; or delete these episodes (lerobot-edit-dataset)" if some else ""
+        raise ValueError(f"{root}: {found}{advice}")
 
 
 def _name_episodes(episodes: list[int]) -> str:
