@@ -109,8 +109,6 @@ def add_dynamics(
         raise ValueError(f"--preview must be at least 1 episode, got {preview}")
     root = find_dataset(dataset)
     info, meta = read_info(root), find_meta(root)
-    if replace and preview is not None:
-        raise ValueError("--replace has no effect with --preview; leave it out")
     old = [name for q in DYNAMICS if (name := f"dynamics.{q}") in info["features"]]
     if old and not replace and preview is None:
         raise ValueError(f"{root} must not have {', '.join(old)}; replace them with --replace")

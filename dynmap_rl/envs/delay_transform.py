@@ -99,8 +99,15 @@ class DelayTransform(Transform):
 
     def _frames_of(self, tensordict: TensorDictBase) -> torch.Tensor:
         """Return the frames of all worlds ``[N, ...]``; an environment without batch dimensions is one world."""
+        self._check_frames(tensordict)
         pixels = tensordict[self.in_keys[0]]
         return pixels.reshape(tensordict.batch_size.numel(), *pixels.shape[tensordict.ndim :])
+
+    def _check_frames(self, observation: TensorDictBase | Composite) -> None:
+        if self.in_keys[0] not in observation.keys(True):
+            raise ValueError(
+                f"{self.in_keys[0]} must be an observation of the environment: make it with from_pixels=True"
+            )
 
     def _deliver(self, tensordict: TensorDictBase) -> TensorDictBase:
         length, batch = len(self._frames), tensordict.batch_size
@@ -127,10 +134,7 @@ class DelayTransform(Transform):
         return tensordict.set(self.out_keys[1], delay.reshape(*batch, self.places))
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        if self.in_keys[0] not in observation_spec.keys(True):
-            raise ValueError(
-                f"{self.in_keys[0]} must be an observation of the environment: make it with from_pixels=True"
-            )
+        self._check_frames(observation_spec)
         shape, pixels = observation_spec.shape, observation_spec[self.in_keys[0]]
         if self.bursts:
             frame = pixels.shape[len(shape) :]

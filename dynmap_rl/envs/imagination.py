@@ -170,4 +170,4 @@ def make_start(
     poses = [agent_pos, unravel_key(("next", agent_pos))] if agent_pos else []
     frames = frames.select("pixels", "action", "goal", *poses, strict=False)
     transform = WorldModelTransform(world_model, agent_pos=agent_pos)
-    return transform(frames).exclude("pixels", "action", *poses)[:, -1]
+    return transform(frames).exclude("pixels", "action", "next", *poses)[:, -1]

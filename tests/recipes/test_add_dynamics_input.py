@@ -59,7 +59,6 @@ def dataset(tmp_path_factory):
             "--order has no effect with --method central",
         ),
         ({"period": 360.0}, "--period has no effect with a state without --angles"),
-        ({"output": None, "preview": 2, "replace": True}, "--replace has no effect with --preview"),
     ],
 )
 def test_bad_input_is_refused_before_anything_is_written(dataset, tmp_path, settings, message):
