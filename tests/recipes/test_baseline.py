@@ -38,11 +38,13 @@ def test_it_trains_on_the_training_split_alone(train, recording):
     assert given.partition("=")[2] == str(list(range(*load_meta(recording)["splits"]["train"])))
 
 
-def test_a_stopped_run_goes_on_at_its_last_checkpoint(train, tmp_path):
+def test_a_stopped_run_goes_on_at_its_last_checkpoint(train, recording, tmp_path):
+    """The stored settings name the places of before the run or the dataset was moved."""
     settings = tmp_path / "lerobot" / baseline.TRAINED / "train_config.json"
     settings.parent.mkdir(parents=True)
     settings.touch()
-    assert train() == [f"--config_path={settings}", "--resume=true", "--policy.device=cpu"]
+    places = [f"--output_dir={tmp_path / 'lerobot'}", f"--dataset.root={recording}"]
+    assert train() == [f"--config_path={settings}", "--resume=true", "--policy.device=cpu", *places]
 
 
 def test_a_failed_training_ends_with_the_last_line_of_its_log(train):
