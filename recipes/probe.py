@@ -84,10 +84,8 @@ def main(config: Config) -> None:
         if decodes_poses(model)
     }
     probes = {name: probe(model, train, test) for name, model in models.items()}
-    rows = read_metadata(find_dataset(dataset) / META, {"episodes": [{"split": str, "scene": dict}]})[
-        "episodes"
-    ]
-    rows = [row for row in rows if row["split"] == "eval"][: len(test)]
+    meta = read_metadata(find_dataset(dataset) / META, {"episodes": [{"split": str, "scene": dict}]})
+    rows = [row for row in meta["episodes"] if row["split"] == "eval"][: len(test)]
     read_scene = get_task(task).ranges.scene.from_dict
     judged = {
         "held-out demonstrations": (test, [read_scene(row["scene"]) for row in rows]),
