@@ -18,11 +18,8 @@ from dynmap_rl.utils.settings import flatten
 
 FORMAT = 2  # of config.json; the first release had flat settings
 INPUTS = {"dataset.json", "world_model.json"}  # hashes of what a run has begun with
-UNTRAINED = {
-    ".lock",
-    "config.json",
-    ".config.json.tmp",
-} | INPUTS  # files of a run that has failed before its training
+# Files of a run that has failed before its training.
+UNTRAINED = {".lock", ".config.json.tmp", "config.json"} | INPUTS
 
 
 def open_run(folder: Path, config, *, ignore: tuple[str, ...] = ()) -> Path:
