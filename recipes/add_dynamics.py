@@ -115,6 +115,8 @@ def main(config: Config) -> None:
         entries = ", ".join(f"{value:.3g}" for value in difference)
         lines.append(f"mean absolute difference from the replaced {quantity}: {entries}")
     text = "\n".join([quality_text(found["quality"]), *lines])
+    if found["view"]:
+        text = f"frames of {found['view'].column}\n{text}"
     print(text)
     folder = Path("runs/add_dynamics_preview") / Path(config.dataset).resolve().name
     if config.output:

@@ -45,7 +45,7 @@ class Config:
 def main(config: Config) -> None:
     """Record, report and upload."""
     from dynmap_rl.data.demonstrations import META, load_meta
-    from dynmap_rl.data.format.hub import check_uploadable, push_dataset
+    from dynmap_rl.data.format.hub import check_login, check_uploadable, push_dataset
     from dynmap_rl.data.recording.record import record_dataset
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.reporting.dataset_page import write_dataset_page
@@ -57,6 +57,7 @@ def main(config: Config) -> None:
         refuse(config, Config(), ["workers"], "--launcher ray")
     if config.push_to_hub:
         check_uploadable(config.task, get_task(config.task).layout)
+        check_login()
     complete = (output / META).exists()
     sizes = config.episodes, config.eval_episodes
     record_dataset(output, config.task, config.kind, *sizes, config.workers, config.expert, config.launcher)

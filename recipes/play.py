@@ -61,7 +61,7 @@ def main(config: Config) -> None:
     import torch
 
     from dynmap_rl.data.demonstrations import META, load_meta
-    from dynmap_rl.data.format.hub import check_uploadable, push_dataset
+    from dynmap_rl.data.format.hub import check_login, check_uploadable, push_dataset
     from dynmap_rl.data.recording.human import list_shards, next_scene, open_folder, publish_episodes
     from dynmap_rl.envs.tasks import get_task
     from dynmap_rl.play.session import MAX_DELAY, Session
@@ -95,6 +95,7 @@ def main(config: Config) -> None:
         raise ValueError("--push_to_hub needs --record, the folder of the demonstrations")
     if config.push_to_hub:
         check_uploadable(task, layout)
+        check_login()
     published, first = 0, config.scene
     if config.record:
         open_folder(config.record, task)
@@ -106,7 +107,10 @@ def main(config: Config) -> None:
     session = Session(task, actor, config.expert, first, split, config.delay)
     if config.driver:
         if config.driver not in session.drivers:
-            raise ValueError(f"--driver must be one of {', '.join(session.drivers)}, got {config.driver!r}")
+            needs = {"expert": "; give --expert", "policy": "; give --policy"}.get(config.driver, "")
+            raise ValueError(
+                f"--driver must be one of {', '.join(session.drivers)}, got {config.driver!r}{needs}"
+            )
         session.driver = config.driver
     window, frames = PlayWindow(session, config.size), []
     try:

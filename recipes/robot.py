@@ -160,7 +160,7 @@ def check_config(config: Config) -> None:
 def describe_pieces(data: dict) -> str:
     """Return what is trained on and held out as text."""
     held_out = ", ".join(map(str, data["splits"]["eval"]))
-    text = f"pieces of {data['steps']} steps"
+    text = f"frames of {', '.join(data['cameras'])}; pieces of {data['steps']} steps"
     if data["steps"] in (lengths := data["lengths"]).values():  # otherwise all are longer
         text += f", as long as episode {next(e for e, n in lengths.items() if n == data['steps'])}"
     text += f"; held out: episodes {held_out}"

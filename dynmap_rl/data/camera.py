@@ -178,7 +178,7 @@ def measure(frames: np.ndarray, factor: Sequence[float], camera: FrameSource, ti
         time: times of the frames ``[T]`` (s).
 
     Raises:
-        ValueError: what should be tracked is not found. The message is the end of a sentence.
+        ValueError: what should be tracked is not found.
     """
     (count, height, width), size = frames.shape[:3], camera.size
     place, scale = _scale(height, width, factor, camera.width, size)

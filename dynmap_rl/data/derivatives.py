@@ -27,23 +27,24 @@ def differentiate(
         Velocity and acceleration ``[T, D]``, per s and per s^2, float64.
 
     Raises:
-        ValueError: there are too few steps, or times do not increase or, for ``savgol``, are not uniform. The message
-            is the end of a sentence.
+        ValueError: there are too few steps, or times do not increase or, for ``savgol``, are not uniform.
     """
     from scipy.signal import savgol_filter
 
     steps = np.diff(time)
     needed = window if method == "savgol" else 3
     if len(position) < needed:
-        raise ValueError(f"must have at least {needed} steps for --method {method}, got {len(position)}")
+        raise ValueError(
+            f"positions must have at least {needed} steps for --method {method}, got {len(position)}"
+        )
     if not (steps > 0).all():
-        raise ValueError("must have timestamps that increase")
+        raise ValueError("timestamps must increase")
     if method == "central":
         velocity = np.gradient(position, time, axis=0, edge_order=2)
         return velocity, np.gradient(velocity, time, axis=0, edge_order=2)
     if not is_uniform(time):
         raise ValueError(
-            f"must have uniform timestamps for --method savgol, got distances of {steps.min():.4g} to "
+            f"timestamps must be uniform for --method savgol, got distances of {steps.min():.4g} to "
             f"{steps.max():.4g} s; use --method central"
         )
     mean = (time[-1] - time[0]) / (len(time) - 1)

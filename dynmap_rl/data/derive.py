@@ -189,7 +189,7 @@ def _derive_parts(
             try:
                 found, motion = _derive(motion, time[rows[episode]], method, window, order)
             except ValueError as error:
-                raise ValueError(f"{root}: episode {episode} {error}") from error
+                raise ValueError(f"{root}: episode {episode}: {error}") from error
             for quantity, part in found.items():
                 values[quantity][rows[episode], own] = part
             if motion.found is not None:

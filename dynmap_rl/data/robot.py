@@ -191,12 +191,13 @@ def _check_goal(root: Path, info: dict, goal: str | None) -> tuple[str, list[int
     if goal is None:
         return None
     column, _, text = goal.rpartition(":")
-    entries = parse_numbers(text, "--goal: entries after the colon")
     feature = info["features"].get(column)
     if feature is None or not is_vector(feature):
+        known = ", ".join(name for name, feature in info["features"].items() if is_vector(feature))
         raise ValueError(
-            f"--goal must be a column of numbers and its entries, such as observation.state:3,4, got {goal!r}"
+            f"--goal must be a column and its entries, such as observation.state:3,4, got {goal!r}; columns are {known}"
         )
+    entries = parse_numbers(text, "--goal: entries after the colon")
     if not all(0 <= i < feature["shape"][0] for i in entries):
         raise ValueError(f"--goal: entries of {column} must be 0 to {feature['shape'][0] - 1}, got {text}")
     return column, entries

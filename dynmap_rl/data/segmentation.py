@@ -58,7 +58,7 @@ def split_colors(frames: np.ndarray, masks: np.ndarray, objects: int, threshold:
 
     if objects == 1:
         return masks.astype(np.uint8)
-    few = f"must have {objects} objects of different colours that move, got fewer; use fewer --objects"
+    few = f"fewer than {objects} objects of different colours move; use fewer --objects"
     pixels = frames[masks].astype(np.float32)
     sample = pixels[:: max(1, len(pixels) // 20_000)]
     if (count := len(np.unique(sample, axis=0))) < objects:

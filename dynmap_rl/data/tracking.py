@@ -64,7 +64,7 @@ def track_centroid(frames: np.ndarray, threshold: int = 30) -> tuple[np.ndarray,
         ``[T, 2]``, x (right) and y (down) in pixels, float64, and whether something was found, bool ``[T]``.
 
     Raises:
-        ValueError: nothing moves, or specks only. The message is the end of a sentence.
+        ValueError: nothing moves, or specks only.
     """
     background, specks = _background(frames, threshold), False
     centroids = np.full((len(frames), 2), np.nan)
@@ -115,8 +115,7 @@ def track_objects(
         colors: colour of each object (RGB, 0 to 255), instead of ``objects`` and ``sort``.
 
     Raises:
-        ValueError: fewer objects move, a colour is not seen, or no pixel is at rest. The message is the end of a
-            sentence.
+        ValueError: fewer objects move, a colour is not seen, or no pixel is at rest.
     """
     background = _background(frames, threshold)
     changed = np.stack([_changed(frame, background, threshold) > 0 for frame in frames])
@@ -136,10 +135,10 @@ def track_objects(
     found = area >= np.array([faintest(column) for column in area.T])
     if missing := np.flatnonzero(~found.any(0)).tolist():
         if colors is None:
-            raise ValueError(f"must have {objects} objects that move, got fewer; use fewer --objects")
+            raise ValueError(f"fewer than {objects} objects move; use fewer --objects")
         color = "#{:02x}{:02x}{:02x}".format(*colors[missing[0]])
         raise ValueError(
-            f"must show an object of the colour {color}; read its colour off a frame, or raise --threshold, "
+            f"no object of the colour {color} is seen; read its colour off a frame, or raise --threshold, "
             f"got {threshold}"
         )
     pose = np.array([[region[0] for region in row] for row in regions])

@@ -46,7 +46,7 @@ class ImaginationEnv(ModelBasedEnvBase):
         start: TensorDict ``[B]`` with ``latent`` ``[B, Z]``, and optionally ``predicted_latent`` ``[B, Z]`` and the
             memory, four times ``[B, H]`` (default: zeros). A step of a rollout may be given as it is.
         decode_pixels: decode a frame in each step.
-        reward: function from the observations after a step, a TensorDict ``[B]``, to a float32 reward ``[B, 1]``.
+        reward: function from the observations after a step, a TensorDict ``[B]``, to a reward ``[B, 1]``.
 
     Raises:
         ValueError: ``start`` has more or less than one batch axis, or no latents of the world model's size.
@@ -124,7 +124,10 @@ class ImaginationEnv(ModelBasedEnvBase):
         td = self._decode(td)
         reward = latent.new_zeros(*self.batch_size, 1)
         if self.reward_function is not None:
-            reward = torch.where(mask, self.reward_function(td), reward)
+            value = self.reward_function(td)
+            if value.shape != reward.shape:
+                raise ValueError(f"reward must return {list(reward.shape)}, got {list(value.shape)}")
+            reward = torch.where(mask, value.to(reward), reward)
         return td.set("reward", reward)
 
     def _decode(self, td: TensorDict) -> TensorDict:

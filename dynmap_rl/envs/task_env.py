@@ -64,7 +64,10 @@ class TaskEnv(gym.Env):
                 of its layout.
         """
         if options:
-            raise ValueError(f"this environment has no reset options, got {sorted(options)}")
+            raise ValueError(
+                f"this environment has no reset options, got {sorted(options)}; those of cart and block have them in "
+                "DynmapEnv, such as dynmap_rl/BalanceReaching-v1"
+            )
         super().reset(seed=seed)
         scene_seed = int(self.np_random.integers(2**63)) if seed is None else seed
         self.world = self.task.begin(scene_seed, None, self.world)

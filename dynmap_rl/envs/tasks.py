@@ -255,11 +255,10 @@ def _make_task(name: str, from_file: bool) -> BaseTask:
         task = getattr(importlib.import_module(MUJOCO_MODULE if own else module), attribute)
     except (ImportError, AttributeError) as error:
         check_mujoco_gl()
-        hint = (
-            "; MuJoCo tasks need uv pip install -e '.[mujoco]'"
-            if own and isinstance(error, ImportError)
-            else ""
-        )
+        hint = ""
+        if isinstance(error, ImportError):
+            hint = f"; run where {module} can be imported, such as in its folder"
+            hint = "; MuJoCo tasks need uv pip install -e '.[mujoco]'" if own else hint
         raise ValueError(
             f"the task must be module:Class or module:Class:argument=value, got {name!r} ({error}){hint}"
         ) from error

@@ -5,7 +5,9 @@ Plain Python and PyMunk. SI units: m, s, rad, kg. Gravity points along -y.
 
 from __future__ import annotations
 
+import atexit
 import math
+import weakref
 from collections.abc import Sequence
 
 import numpy as np
@@ -32,8 +34,16 @@ GROUND = -0.25  # m, height at which a dropped block comes to rest, below the pi
 DROP_TILT = math.pi / 4  # rad, relative to the cart
 WALL_RADIUS = 0.01  # m, half the thickness of a wall
 
+SPACES: weakref.WeakSet[pymunk.Space] = weakref.WeakSet()  # all that exist
 Wall = tuple[Point, Point]  # the ends of its middle line, m
 CART, BLOCK, WALL = 1, 2, 3  # PyMunk collision types
+
+
+@atexit.register
+def _free_spaces() -> None:
+    """Free what is left at the end of the program; later, PyMunk would lack what it needs for it."""
+    for space in SPACES:
+        vars(space).clear()
 
 
 class World:
@@ -64,6 +74,7 @@ class World:
         self.scene = scene
         self.goal = np.array([scene.goal_x, scene.goal_y])
         self.space = pymunk.Space()
+        SPACES.add(self.space)
         self.space.gravity = (0.0, -GRAVITY)
         self.space.collision_slop = 1e-4  # Chipmunk's default assumes pixels
         self._add_ground()

@@ -83,7 +83,8 @@ class LatentActor(TensorDictModuleBase):
     transforms of the environment.
 
     Args:
-        policy: feed-forward or recurrent.
+        policy: recurrent, feed-forward, or any other module from ``latent``, ``hidden1``, ``hidden2`` and ``goal`` to
+            actions ``[..., A]``.
         states: keys of the latent and of the two hidden states.
         goal: key that is read.
         action: key that is written.
@@ -116,16 +117,18 @@ class LatentActor(TensorDictModuleBase):
         """Act on states ``[..., Z]`` and ``[..., H]`` that are not in the TensorDict.
 
         Raises:
-            TypeError: the policy has a memory and is no :class:`RecurrentPolicy`.
+            TypeError: the policy returns more than actions and is no :class:`RecurrentPolicy`.
         """
         state, keys = None, self.policy_memory
         if keys:
             sizes = dict.fromkeys(keys, self.policy.lstm.hidden_size)
             state = recall(tensordict, sizes, self.is_init, latent.device)
-        action, state = self.policy.step(latent, hidden1, hidden2, tensordict[self.goal], state)
-        if state is not None and not keys:
+        inputs = latent, hidden1, hidden2, tensordict[self.goal]
+        action, state = self.policy.step(*inputs, state) if keys else (self.policy(*inputs), None)
+        if not isinstance(action, torch.Tensor):
             raise TypeError(
-                f"a policy with memory must be a RecurrentPolicy, got {type(self.policy).__name__}"
+                "policy must return actions [..., A] alone, or be a RecurrentPolicy where it has a memory, got "
+                f"{type(action).__name__} of {type(self.policy).__name__}"
             )
         tensordict.set(self.action, action)
         remember(tensordict, keys, state or ())
@@ -157,7 +160,7 @@ class Actor(TensorDictModuleBase):
 
     Args:
         world_model: encoder and transition.
-        policy: feed-forward or recurrent.
+        policy: see :class:`LatentActor`.
         pixels: key that is read.
         goal: key that is read.
         action: key that is written.

@@ -79,7 +79,16 @@ def check_policy(kind: str) -> None:
 
 
 def save_world_model(folder: Path, model: WorldModel) -> None:
-    """Write weights and sizes of a world model to a folder."""
+    """Write weights and sizes of a world model to a folder.
+
+    Raises:
+        TypeError: the world model is of a class that :func:`load_world_model` does not know.
+    """
+    if type(model) is not WorldModel:
+        raise TypeError(
+            f"model must be a WorldModel, got {type(model).__name__}; store a class of your own with "
+            "torch.save(model.state_dict(), path)"
+        )
     arguments = {
         "action": model.transition.action.size,
         "dynamics": model.sizes,
@@ -125,7 +134,15 @@ def save_policy(folder: Path, policy: FeedforwardPolicy | RecurrentPolicy, world
         folder: gets ``weights.safetensors`` and ``arguments.json``.
         policy: policy to save.
         world_model: world model whose states the policy reads.
+
+    Raises:
+        TypeError: the policy is of a class that :func:`load_policy` does not know.
     """
+    if type(policy) not in POLICIES.values():
+        raise TypeError(
+            f"policy must be a FeedforwardPolicy or a RecurrentPolicy, got {type(policy).__name__}; store a class of your "
+            "own with torch.save(policy.state_dict(), path)"
+        )
     arguments = {
         "kind": policy.kind,
         "latent_size": world_model.latent_size,

@@ -25,8 +25,11 @@ class Encoder(nn.Module):
 
         Raises:
             ValueError: the frames have another shape, or are floats in 0..1 or below 0.
+            TypeError: the weights are not float32.
         """
         side = self.image_size
+        if (dtype := next(self.parameters()).dtype) != torch.float32:
+            raise TypeError(f"weights must stay float32, got {dtype}; for less precision use torch.autocast")
         if pixels.shape[-3:] != (3, side, side):
             raise ValueError(f"pixels must be [..., 3, {side}, {side}], got {list(pixels.shape)}")
         if not pixels.numel():

@@ -81,6 +81,9 @@ def write_robot_report(
         "policy": policy,
         "trained_on": {
             "dataset": str(dataset),
+            "cameras": described["cameras"],
+            "fps": described["info"].get("fps"),
+            "goal": goal,
             "held_out_episodes": episodes["episode"].unique().tolist(),
             "held_out_pieces": list(episodes.shape),
         },
@@ -108,8 +111,12 @@ def robot_row_text(result: dict) -> str:
     """Return the result of :func:`write_robot_report` as lines of text."""
     errors, trained_on = result["held_out"], result["trained_on"]
     held_out = len(trained_on["held_out_episodes"])
-    lines = [
-        f"{result['row']}, {result['policy']} policy, {trained_on['dataset']}",
+    lines = [f"{result['row']}, {result['policy']} policy, {trained_on['dataset']}"]
+    if "cameras" in trained_on:  # older results lack them
+        lines.append(
+            f"  frames of {', '.join(trained_on['cameras'])} at {trained_on['fps']} Hz, goal {trained_on['goal'] or 'none'}"
+        )
+    lines += [
         f"  held-out errors on {held_out} episodes; there is no simulator, thus no DR, PE or SR",
         f"  rgb {errors['rgb']:.4f} (root mean square)   imitation L1 {errors['imitation_l1']:.4f} (normalised)",
     ]

@@ -121,7 +121,7 @@ def task_of_run(run: Path) -> str | None:
         raise ValueError(f"{run / 'config.json'}: task must be a name, got {task}; restore the file")
     if task is None and settings.get("dataset"):
         raise ValueError(
-            f"{run} was trained on the robot dataset {settings['dataset']}, for which there is no simulator; see the "
-            "held-out errors in its eval.json"
+            f"{run} was trained on the robot dataset {settings['dataset']}, which has no simulator and no policy type of "
+            "LeRobot; its held-out errors are in eval.json, RobotActor and export_to_onnx bring it to a robot"
         )
     return task

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -31,6 +32,7 @@ from .settings import EndToEndTraining, WorldModelTraining, windows_at
 
 ADVICE = "the last saved state is kept; run again with a lower learning rate, in another --run"
 SAVE_EVERY = 250  # updates
+SAVE_AFTER = 60  # seconds, in a single process; several would not agree
 
 
 @translate_errors()
@@ -59,7 +61,7 @@ def fit(
         settings: sizes, augmentation and learning rate.
         seed: seed of the windows.
         logger: see :func:`dynmap_rl.runs.loggers.log_metrics`.
-        save_every: updates between training states.
+        save_every: updates between training states, which a single process also saves after a minute.
 
     Raises:
         ValueError: the loss is not finite or diverges, a batch cannot be divided among the processes, or the folder
@@ -112,7 +114,10 @@ def fit(
     loss_module = share_gradients(loss_module, some=unused)
     part = slice(rank(), None, ranks())
     bar = {"initial": start} | ({"disable": True} if rank() else {})  # False would override TQDM_DISABLE
-    progress = tqdm(range(start, settings.updates), folder.name, settings.updates, **bar)
+    progress, clock = (
+        tqdm(range(start, settings.updates), folder.name, settings.updates, **bar),
+        time.monotonic(),
+    )
     for update in progress:
         set_learning_rate(optimizer, settings.learning_rate, update, settings.updates)
         batch, length = windows_at(settings, update)
@@ -124,13 +129,15 @@ def fit(
             losses = loss_module(windows)
         norm = step(sum(losses.values()), optimizer)
         done = update + 1
-        saved = done % save_every == 0 or done == settings.updates
+        logged = done % save_every == 0 or done == settings.updates
+        saved = logged or (ranks() == 1 and time.monotonic() - clock > SAVE_AFTER)
         if saved or done % 50 == 0 or done == 1:
             losses = {name: mean_over_ranks(value).item() for name, value in losses.items()}
             first = check_loss(sum(losses.values()), norm, first)
             progress.set_postfix({k.removeprefix("loss_"): f"{v:.3f}" for k, v in losses.items()})
-        if saved and not rank():
+        if logged and not rank():
             log_metrics(folder, done, logger, **losses, **held_out())
+        if saved and not rank():
             save_training_state(
                 path,
                 model=model.state_dict(),
@@ -141,6 +148,7 @@ def fit(
                 form=form,
                 data=data,
             )
+            clock = time.monotonic()
 
 
 def _hash_labels(episodes: TensorDictBase) -> str:

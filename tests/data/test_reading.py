@@ -105,6 +105,12 @@ def test_a_side_is_averaged_where_it_is_reduced_though_the_other_is_enlarged():
     assert (join_views([view], 32) == 50).all()
 
 
+def test_pictures_of_another_form_are_refused():
+    for view in (np.zeros((3, 16, 16), np.uint8), np.zeros((16, 16, 3)), np.zeros((16, 16), np.uint8)):
+        with pytest.raises(ValueError, match="height, width, 3"):
+            join_views([view])
+
+
 def test_frames_of_two_sizes_are_refused(tmp_path):
     (tmp_path / "data/chunk-000").mkdir(parents=True)
     images = [cv2.imencode(".png", np.zeros((side, 8, 3), np.uint8))[1].tobytes() for side in (8, 6)]

@@ -154,7 +154,7 @@ def test_an_object_of_a_given_colour_that_rests_is_found():
 
 
 def test_a_colour_that_is_not_there_is_refused():
-    with pytest.raises(ValueError, match="#00ff00; .*--threshold"):
+    with pytest.raises(ValueError, match="#00ff00 .*--threshold"):
         track_objects(film(make_poses(), SIZE), colors=[COLORS[0], (0, 255, 0)])
 
 

@@ -234,3 +234,16 @@ def test_the_start_moves_with_the_environment(frames):
     env = ImaginationEnv(make_model(), make_start(make_model(), frames))
     env.action_spec = env.observation_spec["latent"].clone()  # bounds cannot be checked without values
     assert env.to("meta") is env and env.start.device == torch.device("meta")
+
+
+def test_a_reward_of_another_shape_is_refused_and_of_another_type_cast(frames):
+    model = make_model()
+    for shape, fine in (((B,), False), ((B, 1), True)):
+        env = ImaginationEnv(
+            model, make_start(model, frames), reward=lambda td, s=shape: torch.ones(s).double()
+        )
+        if fine:
+            assert env.rollout(2)["next", "reward"].dtype == torch.float32
+        else:
+            with pytest.raises(ValueError, match=r"reward must return \[3, 1\]"):
+                env.rollout(2)

@@ -1,6 +1,8 @@
 """Bad input of the batched TorchRL environment: errors that say what is wrong."""
 
 import re
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -52,3 +54,12 @@ def test_what_a_reset_does_not_know_is_refused():
         env.reset(scene_seed=torch.tensor([0.5, 1.5]))
     with pytest.raises(ValueError, match="scene_seed .*at least 0"):
         env.reset(scene_seed=torch.tensor([0, -1]))
+
+
+def test_a_program_that_leaves_worlds_behind_ends_in_silence():
+    code = (
+        "import dynmap_rl\nfrom dynmap_rl.envs import DynmapBatchedEnv\n"
+        "env = DynmapBatchedEnv('balance_reaching', 3)\ntd = env.rollout(2)"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (result.returncode, result.stderr) == (0, "")

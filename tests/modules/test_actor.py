@@ -211,14 +211,21 @@ def test_memory_that_a_part_of_the_batch_lacks_is_missed():
         make_actor()(td)
 
 
-def test_a_policy_of_another_class_has_no_memory():
+@torch.no_grad()
+def test_any_module_acts_that_returns_actions_alone():
     class Policy(torch.nn.Module):
-        def step(self, latent, hidden1, hidden2, goal, state):
+        def forward(self, latent, hidden1, hidden2, goal):
+            return latent[..., :3] + goal[..., :1]
+
+    class WithMemory(torch.nn.Module):
+        def forward(self, latent, hidden1, hidden2, goal):
             return goal, (goal,)
 
-    actor, frames = make_actor(), make_frames()
-    with pytest.raises(TypeError, match="RecurrentPolicy, got Policy"):
-        Actor(actor.world_model, Policy())(frames[:, 0].select("pixels", "goal"))
+    world_model, frames = make_actor().world_model, make_frames()[:, 0].select("pixels", "goal")
+    td = Actor(world_model, Policy())(frames.copy())
+    torch.testing.assert_close(td["action"], td["latent"][..., :3] + td["goal"][..., :1])
+    with pytest.raises(TypeError, match="RecurrentPolicy.* of WithMemory"):
+        Actor(world_model, WithMemory())(frames.copy())
 
 
 @torch.no_grad()

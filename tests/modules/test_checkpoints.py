@@ -15,6 +15,7 @@ from dynmap_rl.modules.checkpoints import (
     save_policy,
     save_world_model,
 )
+from dynmap_rl.modules.policy import FeedforwardPolicy
 from dynmap_rl.modules.world_model import WorldModel
 from dynmap_rl.utils.weights import fingerprint
 
@@ -29,6 +30,23 @@ def test_checkpoints_are_complete(tmp_path, kind, architecture):
     for before, after in zip((model, policy), loaded, strict=True):
         assert type(before) is type(after) and not after.training
         assert fingerprint(before) == fingerprint(after)
+
+
+def test_a_class_that_could_not_be_loaded_is_not_saved(tmp_path):
+    class Policy(FeedforwardPolicy):
+        pass
+
+    class Model(WorldModel):
+        pass
+
+    model = make_model()
+    policy = make_policy(CONSTANTS, "feedforward", model)
+    model.__class__, policy.__class__ = Model, Policy
+    with pytest.raises(TypeError, match="got Policy"):
+        save_policy(tmp_path, policy, model)
+    with pytest.raises(TypeError, match="got Model"):
+        save_world_model(tmp_path, model)
+    assert not any(tmp_path.iterdir())
 
 
 def test_a_world_model_of_the_first_release_is_plain_or_refused(tmp_path):

@@ -23,6 +23,8 @@ def test_encoder_keeps_leading_axes_and_refuses_other_frames(make):
         encoder(torch.zeros(1, 3, 32, 32))
     with pytest.raises(ValueError, match="floats in -1"):
         encoder(frames.float() / 64 - 1)
+    with pytest.raises(TypeError, match="must stay float32, got torch.bfloat16"):
+        make(16).bfloat16()(frames)
     shifted = torch.cat([torch.zeros(1, dtype=torch.uint8), frames.flatten()])[1:].view(frames.shape)
     torch.testing.assert_close(encoder(shifted), latent)  # bytes that begin anywhere in memory
 

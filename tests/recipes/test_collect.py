@@ -43,3 +43,13 @@ def test_what_cannot_be_uploaded_is_not_recorded(tmp_path):
     result = run(tmp_path, "collect", "--task", "mujoco:PlateSlide", "--push_to_hub", "me/plates")
     assert result.returncode == 2 and "--push_to_hub" in result.stderr
     assert not any(tmp_path.iterdir())
+
+
+def test_without_the_hub_nothing_is_recorded_for_it(tmp_path, monkeypatch):
+    result = run(tmp_path, "collect", "--push_to_hub", "me/mine")
+    assert result.returncode == 2 and "HF_HUB_OFFLINE" in result.stderr
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
+    monkeypatch.setattr("huggingface_hub.get_token", lambda: None)
+    result = run(tmp_path, "collect", "--push_to_hub", "me/mine")
+    assert result.returncode == 2 and "hf auth login" in result.stderr
+    assert not any(tmp_path.iterdir())

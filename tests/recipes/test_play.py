@@ -83,6 +83,7 @@ def test_episodes_of_a_person_become_a_dataset(tmp_path, monkeypatch):
     """The expert acts in the place of the person."""
     monkeypatch.setattr(Session, "_person_action", Session._expert_action)
     pushed = []
+    monkeypatch.setattr("dynmap_rl.data.format.hub.check_login", lambda: None)
     monkeypatch.setattr("dynmap_rl.data.format.hub.push_dataset", lambda *arguments: pushed.append(arguments))
     arguments = "--driver", "person", "--record", "mine", "--steps", 141 + 120, "--size", 64
     result = run(tmp_path, "play", *arguments, "--push_to_hub", "someone/mine")
@@ -158,7 +159,7 @@ def test_without_a_display_the_error_is_one_line(tmp_path, monkeypatch):
         (["--policy", "balance_reaching", "--imagine_from", "120"], "got 120"),
         (["--push_to_hub", "someone/mine"], "--record"),
         (["--expert", "bin_dropping"], "--expert"),
-        (["--driver", "policy"], "--driver"),
+        (["--driver", "policy"], "give --policy"),
         (["--policy", "nothing"], "nothing"),
         (["--expert", "nobody"], "nobody"),
     ],

@@ -42,6 +42,29 @@ def test_a_resumed_training_equals_an_uninterrupted_one(tmp_path, monkeypatch, s
     assert read_metrics(tmp_path / "parts") == read_metrics(tmp_path / "whole")
 
 
+def test_a_training_is_also_saved_once_in_a_while(tmp_path, monkeypatch):
+    def train(folder, **patches):
+        with monkeypatch.context() as patch:
+            for name, value in patches.items():
+                patch.setattr(loop, name, value)
+            train_world_model(make_model(), make_episodes(), tmp_path / folder, WORLD_MODEL)
+
+    step, updates = loop.step, []
+
+    def stop_at_the_third(*arguments):
+        updates.append(1)
+        if len(updates) == 3:
+            raise KeyboardInterrupt
+        return step(*arguments)
+
+    train("whole")
+    with pytest.raises(KeyboardInterrupt):
+        train("parts", step=stop_at_the_third, SAVE_AFTER=0)
+    assert loop.load_training_state(tmp_path / "parts/checkpoint/world_model.pt")["update"] == 2
+    train("parts")
+    assert read_metrics(tmp_path / "parts") == read_metrics(tmp_path / "whole")
+
+
 def test_a_folder_with_a_training_of_other_settings_is_refused(tmp_path):
     """Otherwise its weights would be taken for those of the new settings."""
     train_world_model(make_model(), make_episodes(), tmp_path, WORLD_MODEL)

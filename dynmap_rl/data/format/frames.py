@@ -177,7 +177,16 @@ def join_views(views: Sequence[np.ndarray], image_size: int = 64) -> np.ndarray:
 
     Returns:
         uint8 ``[S, cameras * S, 3]``, the frame that :class:`dynmap_rl.modules.RobotActor` takes.
+
+    Raises:
+        ValueError: a picture has another form.
     """
+    for view in map(np.asarray, views):
+        if view.dtype != np.uint8 or view.ndim != 3 or view.shape[-1] != 3 or not view.size:
+            raise ValueError(
+                f"views must be uint8 pictures [height, width, 3], got {view.dtype} {list(view.shape)}; of a float tensor "
+                "[3, height, width] in 0..1, give (255 * x).byte().permute(1, 2, 0).numpy()"
+            )
     return np.concatenate([_resize(view, (image_size, image_size)) for view in views], 1)
 
 

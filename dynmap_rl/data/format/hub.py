@@ -74,6 +74,16 @@ def check_uploadable(task: str, layout: Layout) -> None:
         )
 
 
+def check_login() -> None:
+    """Raise ``ValueError`` where nothing could be uploaded, so that it is known before a recording."""
+    from huggingface_hub import constants, get_token
+
+    if constants.HF_HUB_OFFLINE:
+        raise ValueError("--push_to_hub needs the hub, but HF_HUB_OFFLINE is set; unset it")
+    if get_token() is None:
+        raise ValueError("--push_to_hub needs an account on the hub; log in with `hf auth login`")
+
+
 def push_dataset(root: str | Path, repo_id: str) -> None:
     """Upload a recording to the Hugging Face hub, with a card and a picture.
 
