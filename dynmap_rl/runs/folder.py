@@ -19,7 +19,7 @@ from dynmap_rl.utils.settings import flatten
 FORMAT = 2  # of config.json; the first release had flat settings
 INPUTS = {"dataset.json", "world_model.json"}  # hashes of what a run has begun with
 # Files of a run that has failed before its training.
-UNTRAINED = {".lock", ".config.json.tmp", "config.json"} | INPUTS
+UNTRAINED = {"config.json"} | INPUTS
 
 
 def open_run(folder: Path, config, *, ignore: tuple[str, ...] = ()) -> Path:
@@ -48,13 +48,13 @@ def open_run(folder: Path, config, *, ignore: tuple[str, ...] = ()) -> Path:
 def _open(folder: Path, config, ignore: tuple[str, ...]) -> Path:
     path = folder / "config.json"
     if not rank():
-        if folder.exists() and not path.exists() and {file.name for file in folder.iterdir()} - UNTRAINED:
+        if folder.exists() and not path.exists() and _names(folder) - UNTRAINED:
             raise ValueError(
                 f"{folder} must be a run or a new folder, got something else; choose another --run"
             )
         lock_folder(folder)
     settings = {"format": FORMAT, **plain_settings(config)}
-    untrained = {file.name for file in folder.iterdir()} <= UNTRAINED
+    untrained = _names(folder) <= UNTRAINED
     begun = path.exists()
     if not begun or (untrained and not rank()):
         for name in INPUTS if begun else ():  # in a folder without config.json, they are somebody else's
@@ -74,6 +74,11 @@ def _open(folder: Path, config, ignore: tuple[str, ...]) -> Path:
             f"{folder} holds a run with other settings ({detail}); choose another --run, or delete the folder"
         )
     return folder
+
+
+def _names(folder: Path) -> set[str]:
+    """Return what a folder holds, without hidden files such as a lock or those of a file manager."""
+    return {file.name for file in folder.iterdir() if not file.name.startswith(".")}
 
 
 def compare_settings(stored: dict, config) -> dict[str, tuple]:

@@ -76,6 +76,11 @@ def test_a_file_of_a_runs_inputs_in_a_folder_without_settings_is_kept(tmp_path):
     assert read_json(tmp_path / "dataset.json") == {"of": "somebody"}
 
 
+def test_a_hidden_file_of_a_file_manager_is_no_content(tmp_path):
+    (tmp_path / ".DS_Store").write_bytes(b"")
+    open_run(tmp_path, Settings())
+
+
 def test_a_run_that_is_older_than_a_setting_has_its_default(tmp_path):
     open_run(tmp_path, Settings())
     append_metrics(tmp_path, 1)
