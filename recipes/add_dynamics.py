@@ -63,7 +63,7 @@ class Config:
     colors: str | None = None
     # Difference of a colour channel, 0 to 255, from which on a pixel counts as moving, and colours as different.
     threshold: int = 30
-    # Order of the objects: lowest (at first), largest or brightest one first; it must be the same in all episodes.
+    # Order of the objects: lowest (in the first frame), largest or brightest first; the same in all episodes.
     sort: str = "lowest"
     # Leave the angles of tracked objects out, as for round ones.
     point: bool = False

@@ -3,7 +3,7 @@
     python recipes/end_to_end.py
     python recipes/end_to_end.py --policy.kind feedforward
 
-Every seed has a world model of its own; recipes/generalize.py takes the first seed's. Demonstrations are recorded with
+Every seed has a world model of its own; recipes/generalize.py uses the first one. Demonstrations are recorded with
 the shipped expert where they are missing. The same command resumes a stopped run, and prints the result of a finished
 one.
 """

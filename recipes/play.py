@@ -6,11 +6,11 @@
     python recipes/play.py --policy balance_reaching --imagine_from 20 --steps 120 --gif play.gif
     python recipes/play.py --record datasets/mine
 
-Arrows or WASD move the cart, Q and E tilt it, a pressed mouse button calls it; of a MuJoCo task, they move the hand as the
-first camera sees it, Q and E up and down. TAB changes the driver: person, expert or policy. With a policy, the window also
-shows the world model's prediction, one step ahead or, in imagination (I), without frames. PAGE UP and PAGE DOWN make the
-policy's frames late; cart and block are then also drawn translucent, where the model believes them to be. B takes the next
-body in the traces, R the next scene, SPACE pauses, ESC ends.
+Arrows or WASD move the cart, Q and E tilt it, and it follows the pointer while a mouse button is held. In a MuJoCo task the
+keys move the hand as the first camera sees it, Q and E up and down. TAB changes the driver: person, expert or policy. With
+a policy, the window also shows the world model's prediction, one step ahead; I switches the frames off and on
+(imagination). PAGE UP and PAGE DOWN make the policy's frames late; cart and block are then also drawn translucent, where
+the model predicts them. B shows the traces of the next body, R starts the next scene, SPACE pauses, ESC ends.
 
 With --record, every successful episode that the person alone drove is kept at once. At the end, the episodes become a
 LeRobot dataset with a page in runs/play; the next session adds to it.

@@ -3,8 +3,8 @@
     python recipes/probe.py --runs runs/decoupled/balance_reaching/position_velocity_recurrent
     python recipes/probe.py --runs balance_reaching,runs/decoupled/balance_reaching/none_recurrent
 
-On held-out demonstrations with their actions, every world model that decodes positions reads a second of frames and
-predicts two more without (mm and degrees, beside a constant prediction). Linear maps from each state to position,
+On held-out demonstrations with their actions, every world model that decodes positions reads one second of frames and
+predicts two more seconds without frames (mm and degrees, beside a constant prediction). Linear maps from each state to position,
 velocity and acceleration are fitted to training demonstrations (R^2 on held-out ones); a world model whose best state
 explains 0.75 of the velocities is judged good, before any policy is trained. What the world models see is
 measured on held-out demonstrations and on the expert's first ten steps in validation scenes: colours of objects and goal

@@ -163,7 +163,7 @@ def make_start(
     Args:
         world_model: world model that encodes the frames.
         frames: ``[B, T]``, T >= 1, with ``pixels``, ``action`` (the last one is not used) and optionally ``goal``. World
-            models read executed actions, as datasets have them; in a rollout, ``action`` is what was wished for.
+            models read executed actions, as datasets have them; in a rollout, ``action`` is the requested action.
         agent_pos: for rollouts, key of the commanded cart pose, whose changes are the executed actions (see
             :class:`WorldModelTransform`).
 

@@ -107,7 +107,7 @@ class SimulatedWorld(Protocol):
 
 
 class BaseTask(ABC):
-    """What the pipeline asks of a task, whatever simulates it.
+    """Interface between a task and the pipeline, for any simulator.
 
     :class:`dynmap_rl.envs.Task` implements it for carts and blocks in the plane, and
     :class:`dynmap_rl.envs.mujoco.MujocoTask` for Gymnasium environments with MuJoCo. For another simulator, write a

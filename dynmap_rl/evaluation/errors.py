@@ -28,7 +28,7 @@ def prediction_errors(
     """Measure one-step prediction errors.
 
     Args:
-        world_model: what predicts.
+        world_model: world model to measure.
         episodes: TensorDict ``[E, T]`` with ``pixels``, ``action`` and ``dynamics``; dynamics that ``labelled`` says are
             not known are left out.
         batch: episodes at a time.
@@ -91,7 +91,7 @@ def policy_errors(policy: nn.Module, features: TensorDictBase) -> dict[str, floa
     """Measure the errors of a policy's actions.
 
     Args:
-        policy: what is judged.
+        policy: policy to measure.
         features: held-out states and actions (see :func:`dynmap_rl.data.compute_features`).
 
     Returns:
@@ -114,8 +114,8 @@ def judge_held_out(
     """Measure world model and policy on the held-out episodes of a robot dataset.
 
     Args:
-        world_model: what predicts.
-        policy: what acts on the world model's states.
+        world_model: world model to measure.
+        policy: policy on the world model's states.
         load: function that returns episodes, among them ``eval``, and constants of normalisation, such as a
             ``functools.partial`` of :func:`dynmap_rl.data.load_robot_dataset` with ``only="eval"``.
 

@@ -39,7 +39,7 @@ def failure_causes(episodes: TensorDictBase, task: str) -> list[str | None]:
 
     In tasks without cart and block, the object is the first body. It is lost (it falls off the table), or stays within
     10 mm of its start. Otherwise the cause is where it is in the last frame: before, behind, beside, or above or below the
-    goal, at rest or not. Tasks of one's own with cart and block, and those whose goal is not a point of two or three
+    goal, at rest or not. Custom tasks with cart and block, and those whose goal is not a point of two or three
     coordinates, have the cause "other".
 
     Places and speeds are those before the last action, as a step has the state before its action.

@@ -48,7 +48,7 @@ def evaluate(
             does not depend on their number. A script that uses more than one must have the guard ``if __name__ == "__main__"``.
 
     Returns:
-        ``test`` on the shared scenes of ``settings.split``, whichever that is, and, if ``settings.paper_episodes`` is not 0,
+        ``test`` on the shared scenes of ``settings.split`` (under this name for every split) and, if ``settings.paper_episodes`` is not 0,
         ``paper`` on others. Each has ``summary`` (see :func:`dynmap_rl.evaluation.summarize`) and ``rows`` (see
         :func:`pack_rows`).
 

@@ -158,15 +158,15 @@ def outcome_gap(terms: Sequence[tuple[int, list[list[dict]]]], outcome: str = "s
     """Compare the mean outcomes of results on the same start states.
 
     Args:
-        terms: sign, 1 or -1, and rows of each result: for every policy seed those of the same scenes in the same order.
-            Two terms with 1 and -1 are the difference of two results.
+        terms: for each result its sign, 1 or -1, and its rows: a list for each policy seed, all over the same scenes in
+            the same order. Two terms with 1 and -1 are the difference of two results.
         outcome: entry of the rows: a flag, or ``position_error``.
 
     Returns:
         ``gap``, the sum of the means with their signs, in percentage points or mm; its 95 % ``interval`` over the start
         states, after averaging over policy seeds, None if they do not differ; and ``p``, the two-sided probability of a
-        gap of this size if the true gap is zero. Those of flags are by bootstrap, and exact over exchanges of the sign in
-        every start state; those of ``position_error`` are by a t test.
+        gap of this size if the true gap is zero. For flags, the interval is a bootstrap and ``p`` an exact sign-flip test
+        over the start states; for ``position_error``, both are of a t test.
 
     Raises:
         ValueError: the results are not on the same scenes.

@@ -90,7 +90,7 @@ class PlainEncoder(Encoder):
 
 
 class GlimpseEncoder(Encoder):
-    """What K learned attention maps look at, and the frame as seen from the places where the first G of them look.
+    """CNN encoder with K attention maps, and G glimpses: crops of the frame around the positions of the first G maps.
 
     Convolutions on blocks of 4 x 4 pixels, with the context of maps of stride 8 added, end in attention maps of stride 2,
     to which rare colours of the frame are brighter than frequent ones. Each map pools its expected position (spatial

@@ -44,8 +44,8 @@ class WorldModelTraining(WorldModelArchitecture):
     windows: int = 12
     # Time steps of a window.
     window_steps: int = 24
-    # Share of the updates, at first, whose batches have the same number of frames in windows of 4 steps: what objects
-    # look like is learned from many scenes, and memory afterwards.
+    # Share of the updates, from the start, that have windows of 4 steps, with as many frames in a batch: appearance is
+    # learned first, from many scenes, and memory afterwards.
     short_windows: float = 0.4
     # Share of the windows in which no frames are seen after a random step: the world model learns to predict from its own
     # predictions.

@@ -5,7 +5,7 @@
     python recipes/paper/benchmarks3d.py --results runs/benchmarks3d_results     # a grid of your own
     python recipes/paper/benchmarks3d.py --write                      # the page from the results alone
 
-A run is one of another recipe for one task, method and seed, and its result a JSON file; runs with a result are skipped.
+Each run executes another recipe for one task, method and seed, and writes a JSON file; runs with a result are skipped.
 The same command resumes a stopped grid and its runs. Three rows have dynamics that are derived from the recordings, in
 datasets/TASK_hand, _tracks and _color. The page has success, failures by cause, and animations. Needs
 uv pip install -e '.[lerobot,mujoco]'.

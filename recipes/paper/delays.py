@@ -8,8 +8,8 @@
 Each run is evaluated under each condition: on stale frames; with the world model rolled forward; with a delay that is
 reported wrongly; with jitter, lost frames, and pushes that the policy is not told; and, in the place of its policy, with
 a feed-forward policy that is trained to act on an old state of the run's world model and the actions since. A run and a
-condition have one JSON file with an entry for each delay. The same command resumes a stopped grid. Of a policy of
-LeRobot, such as ACT of recipes/baseline.py, the actions of the delay are cut from its chunks.
+condition have one JSON file with an entry for each delay. The same command resumes a stopped grid. For a
+LeRobot policy, such as ACT of recipes/baseline.py, the first actions of a chunk are skipped, one for a step of delay.
 """
 
 import sys
@@ -41,7 +41,7 @@ class Config:
     conditions: str = ""
     # Delays in control steps, with commas between; by default 0 to 30.
     delays: str = ""
-    # Folder of the results, and of the figures, which those of the repository have in media.
+    # Folder of results and figures; the figures of the repository are in recipes/results/media.
     results: Path = RESULTS / "delays"
     # List the measurements and stop.
     dry_run: bool = False
