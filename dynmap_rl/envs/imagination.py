@@ -50,6 +50,7 @@ class ImaginationEnv(ModelBasedEnvBase):
 
     Raises:
         ValueError: ``start`` has more or less than one batch axis, or no latents of the world model's size.
+        TypeError: ``reward`` is no function.
     """
 
     batch_locked = True
@@ -63,6 +64,8 @@ class ImaginationEnv(ModelBasedEnvBase):
         reward: Callable[[TensorDictBase], torch.Tensor] | None = None,
     ):
         _check_start(start, world_model.latent_size)
+        if not (reward is None or callable(reward)):
+            raise TypeError(f"reward must be a function or None, got {reward!r}")
         device = next(world_model.parameters()).device  # to which the world model would be moved
         super().__init__(world_model, device=device, batch_size=start.batch_size)
         self.decode_pixels, self.reward_function = decode_pixels, reward
@@ -124,7 +127,7 @@ class ImaginationEnv(ModelBasedEnvBase):
         td = self._decode(td)
         reward = latent.new_zeros(*self.batch_size, 1)
         if self.reward_function is not None:
-            value = self.reward_function(td)
+            value = torch.as_tensor(self.reward_function(td))
             if value.shape != reward.shape:
                 raise ValueError(f"reward must return {list(reward.shape)}, got {list(value.shape)}")
             reward = torch.where(mask, value.to(reward), reward)

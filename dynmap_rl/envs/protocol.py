@@ -231,6 +231,18 @@ class BaseTask(ABC):
         return type(self).demonstrator is not BaseTask.demonstrator
 
 
+def check_action(action: Any, size: int, what: str = "an action") -> np.ndarray:
+    """Return an action as float32 ``[size]``.
+
+    Raises:
+        ValueError: it has another shape, or is not finite; the message begins with ``what``.
+    """
+    action = np.asarray(action, dtype=np.float32)
+    if action.shape != (size,) or not np.isfinite(action).all():
+        raise ValueError(f"{what} must be {size} finite numbers, got {action}")
+    return action
+
+
 def check_world(
     task: BaseTask, world: SimulatedWorld, frame: np.ndarray | None = None, state: bool = True
 ) -> None:

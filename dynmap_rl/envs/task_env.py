@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from .protocol import check_world
+from .protocol import check_action, check_world
 from .tasks import get_task
 
 
@@ -82,7 +82,8 @@ class TaskEnv(gym.Env):
         task, space = self.task, self.action_space
         if np.shape(action) != space.shape:
             raise ValueError(f"an action must have the shape {space.shape}, got {np.shape(action)}")
-        self.task.step([self.world], [np.clip(np.asarray(action, np.float32), space.low, space.high)])
+        action = check_action(action, len(space.low)).clip(space.low, space.high)
+        self.task.step([self.world], [action])
         truncated = self.world.steps >= self._max_episode_steps
         reward = float(task.reward(self.world))
         return self._observe(), reward, task.is_over(self.world), truncated, self._info()

@@ -236,7 +236,7 @@ def get_task(name: str, from_file: bool = False, kind: type[BaseTask] = BaseTask
     task = TASKS.get(name) or _make_task(name, from_file)
     if not isinstance(task, kind):
         raise ValueError(
-            f"{name} must be a {kind.__name__} here, got a {type(task).__name__}; choose another --task"
+            f"{name} must be a task of cart and block here, a subclass of dynmap_rl.envs.{kind.__name__}"
         )
     return task
 
@@ -256,9 +256,10 @@ def _make_task(name: str, from_file: bool) -> BaseTask:
     except (ImportError, AttributeError) as error:
         check_mujoco_gl()
         hint = ""
-        if isinstance(error, ImportError):
+        if own and isinstance(error, ImportError):
+            hint = "; MuJoCo tasks need uv pip install -e '.[mujoco]'"
+        elif getattr(error, "name", None) == module:
             hint = f"; run where {module} can be imported, such as in its folder"
-            hint = "; MuJoCo tasks need uv pip install -e '.[mujoco]'" if own else hint
         raise ValueError(
             f"the task must be module:Class or module:Class:argument=value, got {name!r} ({error}){hint}"
         ) from error
@@ -267,9 +268,10 @@ def _make_task(name: str, from_file: bool) -> BaseTask:
     if missing := sorted(task.__abstractmethods__):
         raise ValueError(f"the task {name!r} must define {', '.join(missing)}")
     try:
-        made = task(**_parse_arguments(rest[0] if rest else ""))
+        made = task(**(_parse_arguments(rest[0]) if rest else {}))
     except (TypeError, ValueError) as error:
-        raise ValueError(f"the arguments of the task {name!r} are wrong ({error})") from error
+        what = f"the arguments of the task {name!r} are" if rest else f"the task {name!r} is"
+        raise ValueError(f"{what} wrong ({error})") from error
     if rest:
         try:
             made.name = re.sub("[^a-z0-9]+", "_", f"{made.name}_{rest[0].lower()}")
@@ -282,8 +284,11 @@ def _make_task(name: str, from_file: bool) -> BaseTask:
 
 def _parse_arguments(text: str) -> dict[str, object]:
     """Parse ``"image_size=96,arm=True"``; a value that is no literal of Python is a text."""
-    pairs = (part.partition("=")[::2] for part in text.split(",") if part)
-    return {name.strip(): _parse_value(value.strip()) for name, value in pairs}
+    pairs = [part.partition("=")[::2] for part in text.split(",")]
+    values = {name.strip(): _parse_value(value.strip()) for name, value in pairs}
+    if "" in values or len(values) < len(pairs):
+        raise ValueError(f"they must have different names, got {text!r}")
+    return values
 
 
 def _parse_value(text: str) -> object:

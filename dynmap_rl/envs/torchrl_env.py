@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 from dynmap_rl.keys import DYNAMICS
 
 from .gym_env import ACTION_LIMITS
-from .protocol import BaseTask, SimulatedWorld, check_world
+from .protocol import BaseTask, SimulatedWorld, check_action, check_world
 from .scene import SceneRanges, choose_ranges
 from .task import Task
 from .tasks import get_task
@@ -173,7 +173,7 @@ class DynmapBatchedEnv(EnvBase):
         actions = action.to(torch.promote_types(action.dtype, torch.float32)).numpy()[rows]
         if not isinstance(self.task, Task):
             limit = np.array(self.layout.action_limit, np.float32)
-            actions = actions.clip(-limit, limit)
+            actions = [check_action(action, len(limit)).clip(-limit, limit) for action in actions]
         elif self.control == "acceleration":
             actions = [world.action_for(a) for world, a in zip(worlds, actions, strict=True)]
         self.task.step(worlds, actions)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from dynmap_rl.envs.geometry import path_is_blocked, way_from_start
-from dynmap_rl.envs.protocol import BaseTask
+from dynmap_rl.envs.protocol import BaseTask, check_action
 from dynmap_rl.envs.scene import ObstacleScene, scene_seeds
 from dynmap_rl.envs.task import Task
 from dynmap_rl.envs.world import World
@@ -70,7 +70,14 @@ def judge_demonstrator(task: BaseTask, seeds: Iterable[int]) -> dict[str, list[b
         world = task.begin(seed, world=world)
         act = task.demonstrator(world)
         for _ in range(task.layout.steps):
-            task.step([world], [act()])
+            task.step(
+                [world],
+                [
+                    check_action(
+                        act(), len(task.layout.action), f"an action of the demonstrator of {task.name}"
+                    )
+                ],
+            )
         outcomes["success"].append(task.is_success(world))
         outcomes["dropped"].append(world.dropped)
     return outcomes

@@ -44,9 +44,10 @@ def make_world_model(
     Raises:
         ValueError: a quantity has no constants.
     """
-    known = [quantity for quantity in DYNAMICS if quantity in constants]
-    if isinstance(supervision, str) or not set(supervision) <= set(known):
-        raise ValueError(f"supervision must be a sequence of {', '.join(known)}, got {supervision!r}")
+    if isinstance(supervision, str) or not set(supervision) <= set(DYNAMICS):
+        raise ValueError(f"supervision must be a sequence of {', '.join(DYNAMICS)}, got {supervision!r}")
+    if missing := [name for name in ("action", *supervision) if name not in constants]:
+        raise ValueError(f"constants must have {', '.join(missing)}, got {', '.join(constants) or 'none'}")
     dynamics = {q: Normalizer(**constants[q]) for q in supervision}
     sizes = latent_size, hidden_size, architecture, image_size, cameras
     return WorldModel(Normalizer(**constants["action"]), dynamics, *sizes)

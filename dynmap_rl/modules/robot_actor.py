@@ -12,6 +12,7 @@ from tensordict import TensorDict
 
 from .delayed_actor import DelayedActor
 
+FAR = 3  # times the half range of the goals in the demonstrations
 LATE = 0.75  # part of a period by which a call may be late without a missed step
 
 
@@ -66,6 +67,8 @@ class RobotActor:
             goal: ``[G]`` (SI units).
             since: time from which on frames are of the new episode; frames that were taken before it are not used.
 
+        Warns where the goal is far outside those of the demonstrations.
+
         Raises:
             ValueError: the goal has another size than the policy's, or is not finite.
         """
@@ -77,6 +80,11 @@ class RobotActor:
         size = policy.goal.size if hasattr(policy, "goal") else goal.numel()
         if goal.shape != (size,) or not goal.isfinite().all():
             raise ValueError(f"goal must be {size} finite numbers, got {goal.tolist()}")
+        if hasattr(policy, "goal") and (policy.goal.normalize(goal).abs() > FAR).any():
+            warnings.warn(
+                f"the goal {goal.tolist()} is far outside those of the demonstrations; has it their unit?",
+                stacklevel=2,
+            )
         self.goal, self.unused, self.late = goal, 0, 0
         self.since, self.memory, self.actor.blind = since, TensorDict({}, device=self.device), False
         self.frames: list[tuple[float, np.ndarray]] = []
@@ -106,6 +114,8 @@ class RobotActor:
     def act(self, now: float) -> np.ndarray:
         """Return the action of the control step that begins now, float32 ``[A]`` (SI units).
 
+        It is cut to the range of the actions in the demonstrations.
+
         Raises:
             ValueError: no frame has arrived before the first action, ``now`` is not finite or not after the last call, a
                 frame was taken more than a period after ``now``, or :meth:`reset` was not called.
@@ -132,7 +142,9 @@ class RobotActor:
             raise ValueError("the first action needs a frame; call observe before act")
         self.times.append(now)
         td = self.actor(self._receive())
-        self.memory, self.action = td["next"], td[self.actor.actor.action]
+        known = self.actor.world_model.transition.action
+        self.memory, action = td["next"], td[self.actor.actor.action]
+        self.action = action.clamp(known.center - known.scale, known.center + known.scale)
         return self.action.cpu().numpy()
 
     def _check_reset(self) -> None:

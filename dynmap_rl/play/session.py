@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 
 from dynmap_rl.data.recording.plans import KEYS
-from dynmap_rl.envs.protocol import BaseTask
+from dynmap_rl.envs.protocol import BaseTask, check_action
 from dynmap_rl.envs.scene import scene_seed
 from dynmap_rl.envs.task import Task
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
@@ -182,7 +182,10 @@ class Session:
 
     def _expert_action(self) -> np.ndarray:
         if self.demonstrate:
-            return self.demonstrate()
+            size = len(self.env.layout.action)
+            return check_action(
+                self.demonstrate(), size, f"an action of the demonstrator of {self.task.name}"
+            )
         state = torch.from_numpy(self.expert_task.state(self.world))
         return self.world.action_for(self.expert(state)[0].numpy())
 

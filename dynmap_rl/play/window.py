@@ -21,8 +21,7 @@ LOW = {"position": [0, 0, -0.5], "velocity": -VELOCITY_LIMIT, "acceleration": -2
 HIGH = {"position": [1, 1, 0.5], "velocity": VELOCITY_LIMIT, "acceleration": 2 * ACCELERATION_LIMIT}
 LEAST = {"position": 0.1, "velocity": 0.4, "acceleration": 4.0}  # height of a trace in space
 HELP = (
-    "arrows or WASD: move; Q, E: tilt, or up and down;",
-    "mouse button: call the cart",
+    "arrows or WASD: move",
     "TAB: who drives; I: imagination; B: next body",
     "PAGE UP, PAGE DOWN: delay of the policy's frames",
     "R: next scene; SPACE: pause; ESC: end",
@@ -134,7 +133,8 @@ class PlayWindow:
             self._write(f"world model: {source}", right, MARGIN)
             self._show(_first_camera(session.prediction["pixels"]), right)
         else:
-            for i, line in enumerate(HELP):
+            of_task = "Q, E: tilt; mouse button: call the cart" if self.flat else "Q, E: up and down"
+            for i, line in enumerate((HELP[0], of_task, *HELP[1:])):
                 self._write(line, right, MARGIN + LINE * (i + 2), GRAY)
         self._write(self._status(), MARGIN, 2 * MARGIN + LINE + size)
         for row, quantity in enumerate(DYNAMICS):
@@ -162,7 +162,8 @@ class PlayWindow:
         )
         steps = f"step {world.steps} of {session.env.layout.steps}"
         return (
-            f"{steps}; {state}; {self.body}'s dynamics: black true, green predicted"
+            f"{steps}; {state}; {self.body}'s dynamics: black true"
+            + (", green predicted" if session.actor else "")
             + (f"; frames {round(1000 * self.dt * session.delay)} ms late" if session.delay else "")
             + ("; paused" if self.paused else "")
         )

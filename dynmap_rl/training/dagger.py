@@ -14,6 +14,8 @@ from tqdm import tqdm
 
 from dynmap_rl.data.features import compute_features
 from dynmap_rl.envs.scene import SEEDS_PER_SPLIT, scene_seeds
+from dynmap_rl.envs.task import Task
+from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.envs.world import EPISODE_STEPS, limit_actions
 from dynmap_rl.experts.network import list_checkpoints, load_expert, task_of_expert
@@ -68,6 +70,7 @@ def check_corrections(settings: PolicyTraining, task: str | None, seeds: Sequenc
         return
     if task is None:
         raise ValueError("PolicyTraining.corrections need the expert of a task, got no task")
+    get_task(task, kind=Task)
     list_checkpoints(task)
     largest = (SEEDS_PER_SPLIT - FIRST_SCENE) // settings.corrections - 1
     if max(seeds, default=0) > largest:

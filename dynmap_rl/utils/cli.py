@@ -14,7 +14,9 @@ import os
 import re
 import shlex
 import sys
+import sysconfig
 import tempfile
+import traceback
 import typing
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -63,7 +65,7 @@ def run_recipe(
     except KeyboardInterrupt:
         sys.exit(f"stopped; {stopped}")
     except Exception as error:
-        message = describe_error(error)
+        message = describe_error(error, Path(argv[0]).resolve().parent)
         if debug or message is None:
             raise
         print(f"error: {_name_options(message, config_class)}", file=sys.stderr)
@@ -210,8 +212,13 @@ def _suggest(name: str, options: dict[str, type]) -> str:
     return f"do you mean {' or '.join(close)}?" if close else "see --help"
 
 
-def describe_error(error: BaseException) -> str | None:
-    """Return what went wrong and what to do, or None for an error that no user has caused."""
+def describe_error(error: BaseException, recipes: Path) -> str | None:
+    """Return what went wrong and what to do, or None for an error that no user has caused.
+
+    Args:
+        error: the error.
+        recipes: folder of the code that is not the user's own, besides the package.
+    """
     from draccus.utils import DecodingError, DraccusException
 
     while isinstance(error, DraccusException) and not isinstance(error, DecodingError) and error.__cause__:
@@ -222,8 +229,20 @@ def describe_error(error: BaseException) -> str | None:
         return MEMORY
     if not isinstance(error, ValueError | OSError | argparse.ArgumentError | DraccusException):
         return None
-    hint = HINTS.get(getattr(error, "errno", None))
+    hint = HINTS.get(getattr(error, "errno", None)) or _name_place(error, recipes)
     return f"{error}; {hint}" if hint else str(error)
+
+
+def _name_place(error: BaseException, recipes: Path) -> str | None:
+    """Return where code of the user's, such as a task, has raised an error or called a library that has."""
+    libraries = [sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")]
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        path = Path(frame.filename)
+        if any(map(path.is_relative_to, (Path(__file__).parents[1], recipes))):
+            return None
+        if path.exists() and not any(map(path.is_relative_to, libraries)):
+            return f"raised in {path.name}, line {frame.lineno} ({frame.name}); --debug shows the traceback"
+    return None
 
 
 def refuse(settings, default, names: Sequence[str], other: str, prefix: str = "") -> None:

@@ -238,6 +238,8 @@ def test_the_start_moves_with_the_environment(frames):
 
 def test_a_reward_of_another_shape_is_refused_and_of_another_type_cast(frames):
     model = make_model()
+    with pytest.raises(TypeError, match="function"):
+        ImaginationEnv(model, make_start(model, frames), reward=3)
     for shape, fine in (((B,), False), ((B, 1), True)):
         env = ImaginationEnv(
             model, make_start(model, frames), reward=lambda td, s=shape: torch.ones(s).double()

@@ -2,11 +2,13 @@
 
 import copy
 import functools
+import sys
 from dataclasses import replace
 
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from own_task import own_task  # noqa: F401
 
 from dynmap_rl.data.recording import demonstrators
@@ -23,6 +25,8 @@ from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
         ("color=1", "arguments of the task"),
         ("image_size=__import__('os')", "image_size must be one of"),
         ("cameras=front", "cameras must be 1 to 2"),
+        ("cameras=1,cameras=2", "different names"),
+        ("", "different names"),
     ],
 )
 def test_wrong_arguments_are_refused(own_task, arguments, message):  # noqa: F811
@@ -31,7 +35,7 @@ def test_wrong_arguments_are_refused(own_task, arguments, message):  # noqa: F81
 
 
 def test_what_is_for_cart_and_block_is_refused(own_task):  # noqa: F811
-    with pytest.raises(ValueError, match="must be a Task here"):
+    with pytest.raises(ValueError, match="must be a task of cart and block"):
         DynmapBatchedEnv(own_task, 1, control="acceleration")
     with pytest.raises(ValueError, match="without ranges"):
         DynmapBatchedEnv(own_task, 1, ranges=get_task("balance_reaching").ranges)
@@ -179,7 +183,7 @@ def test_a_used_renderer_is_not_copied(own_task):  # noqa: F811
 @pytest.mark.parametrize(
     ("expert", "message"),
     [
-        (lambda: np.zeros(3), "1 finite numbers, got .* in step 0 of scene"),
+        (lambda: np.zeros(3), "step 0, scene 0.* must be 1 finite numbers"),
         (lambda: np.array([np.nan]), "1 finite numbers, got .*nan"),
         (functools.partial(next, iter([])), "must act in every step, but ends in step 0"),
         (None, "must return a function"),
@@ -189,3 +193,43 @@ def test_a_demonstrator_returns_all_entries(own_task, monkeypatch, expert, messa
     monkeypatch.setattr(type(get_task(own_task)), "demonstrator", lambda self, world: expert)
     with pytest.raises(ValueError, match=message):
         demonstrate(own_task, [0])
+
+
+def test_a_marker_that_is_drawn_elsewhere_is_refused(own_task, monkeypatch):  # noqa: F811
+    task = get_task(own_task)
+    world = task.begin(3)
+    np.testing.assert_allclose(world.data.site("goal").xpos, task.goal(world))
+    module = sys.modules[type(task).__module__]
+    monkeypatch.setattr(module, "XML", module.XML.replace('name="goal" pos="0.2 0 0.03"', 'name="goal"'))
+    with pytest.raises(ValueError, match="the site 'goal' has been moved"):
+        task.begin(3)
+
+
+def test_a_refused_action_moves_no_world(own_task):  # noqa: F811
+    env = DynmapBatchedEnv(own_task, 3, seed=0)
+    td = env.reset()
+    for value in (torch.nan, torch.inf):
+        action = torch.zeros(3, 1)
+        action[2] = value
+        with pytest.raises(ValueError, match="finite"):
+            env.step(td.set("action", action))
+    assert [world.steps for world in env.worlds] == [0, 0, 0]
+
+
+def test_names_that_would_be_confused_are_refused(own_task, monkeypatch):  # noqa: F811
+    task = type(get_task(own_task))
+    monkeypatch.setattr(task, "action", ("x", "x"))
+    with pytest.raises(ValueError, match="action must have different names"):
+        task()
+    monkeypatch.undo()
+    monkeypatch.setattr(task, "bodies", (*task.bodies[:1], replace(task.bodies[1], name="goal_keeper")))
+    with pytest.raises(ValueError, match="goal_keeper"):
+        task()
+
+
+def test_a_reward_that_is_no_number_is_refused(own_task, monkeypatch):  # noqa: F811
+    task = get_task(own_task)
+    world = task.begin(0)
+    monkeypatch.setattr(world.env, "step", lambda _: (np.zeros(1), np.nan, False, False, {}))
+    with pytest.raises(ValueError, match="reward must be finite"):
+        task.step([world], [np.zeros(1)])

@@ -32,6 +32,11 @@ def test_checkpoints_are_complete(tmp_path, kind, architecture):
         assert fingerprint(before) == fingerprint(after)
 
 
+def test_constants_that_are_missing_are_named():
+    with pytest.raises(ValueError, match="constants must have position, got action"):
+        make_world_model({"action": CONSTANTS["action"]}, ("position",))
+
+
 def test_a_class_that_could_not_be_loaded_is_not_saved(tmp_path):
     class Policy(FeedforwardPolicy):
         pass

@@ -278,3 +278,14 @@ def test_frames_do_not_pile_up_while_a_robot_is_paused():
     for i in range(100):
         robot.observe(FRAMES[0], i * 0.1)
     assert len(robot.frames) <= 6 and robot.frames[-1][0] == pytest.approx(9.9)
+
+
+def test_actions_stay_in_the_range_of_the_demonstrations_and_a_far_goal_gets_a_warning():
+    robot = make_robot()
+    with pytest.warns(UserWarning, match="far outside"):
+        robot.reset(1000 * GOAL)
+    robot.observe(FRAMES[0], 0.0)
+    low, high = (np.array(CONSTANTS["action"][name], np.float32) for name in ("low", "high"))
+    for t in range(4):
+        action = robot.act(DT * t)
+        assert (low - 1e-6 <= action).all() and (action <= high + 1e-6).all()

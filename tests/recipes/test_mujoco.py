@@ -129,7 +129,7 @@ def test_other_trainings_take_the_task(recorded, recipe):
     ("recipe", "arguments", "message"),
     [
         ("collect", ["--expert", "balance_reaching"], "has an expert of its own"),
-        ("expert", [], "must be a Task here"),
+        ("expert", [], "must be a task of cart and block"),
         ("play", ["--expert", "balance_reaching"], "has an expert of its own"),
         ("decoupled", ["--world_model.augmentation.max_shift", "3"], "augmentation has no effect"),
         ("decoupled", ["--dataset", "datasets/push_image_size_96_cameras_2"], "dataset of"),

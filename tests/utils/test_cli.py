@@ -207,6 +207,20 @@ def test_debug_shows_the_traceback_of_an_expected_error(run):
         run(main=main)
 
 
+def test_an_error_of_the_user_s_code_is_named_by_its_place(run, capsys, tmp_path):
+    (tmp_path / "my_code.py").write_text(
+        "import numpy as np\n\ndef act():\n    return np.zeros(3) + np.zeros(2)\n"
+    )
+    space = {}
+    exec(compile((tmp_path / "my_code.py").read_text(), tmp_path / "my_code.py", "exec"), space)
+    with pytest.raises(SystemExit):
+        run(main=lambda config: space["act"]())
+    assert "raised in my_code.py, line 4 (act)" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        run(main=lambda config: parse_seeds("x"))
+    assert "raised in" not in capsys.readouterr().err
+
+
 def test_the_command_does_not_depend_on_where_the_repository_lies():
     argv = ["/somewhere/recipes/paper/tables.py", "--only", "a b"]
     assert command_line(argv) == "python recipes/paper/tables.py --only 'a b'"

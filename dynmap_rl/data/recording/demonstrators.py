@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from dynmap_rl.envs.protocol import BaseTask, SimulatedWorld, check_world
+from dynmap_rl.envs.protocol import BaseTask, SimulatedWorld, check_action, check_world
 from dynmap_rl.envs.task import Task
 from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.envs.world import limit_actions
@@ -93,11 +93,9 @@ def _demonstrate(
             raise ValueError(
                 f"the demonstrator of {rules.name} must act in every step, but ends in step {t}"
             ) from error
-        if action.shape != limit.shape or not np.isfinite(action).all():
-            raise ValueError(
-                f"the demonstrator of {rules.name} must return {len(limit)} finite numbers, got {action} in step {t} of "
-                f"scene {seed}"
-            )
+        check_action(
+            action, len(limit), f"an action of the demonstrator of {rules.name} (step {t}, scene {seed})"
+        )
         change = noise * rng.standard_normal(len(limit)).astype(np.float32) * limit
         change = change * (not getattr(expert, "exact", False))
         row |= {"action": (action + change).clip(-limit, limit), "expert_action": action.clip(-limit, limit)}

@@ -13,7 +13,7 @@ import gymnasium
 import mujoco
 import numpy as np
 
-from ..protocol import BaseTask, Layout
+from ..protocol import BaseTask, Layout, check_action
 from .bodies import Body
 from .rendering import Camera, FrameRenderer, find_heavy, find_parts, free_unused
 from .world import MujocoWorld
@@ -84,6 +84,10 @@ class MujocoTask(BaseTask):
                 raise ValueError(f"{name} must be a tuple of {kind.__name__}, got {values!r}")
             if len({some.name for some in values}) < len(values):
                 raise ValueError(f"{name} must have different names, got {[some.name for some in values]}")
+        if len(set(self.action)) < len(self.action):
+            raise ValueError(f"action must have different names, got {self.action}")
+        if bad := [body.name for body in self.bodies if body.name == "goal" or body.name.startswith("goal_")]:
+            raise ValueError(f"names of bodies must not be goal or begin with goal_, got {bad}")
         if bad := [view.name for view in self.views if not re.fullmatch("[A-Za-z0-9_]+", view.name)]:
             raise ValueError(f"names of views must be of letters, digits and underscores, got {bad}")
         if not isinstance(image_size, int) or image_size not in SIZES:
@@ -161,6 +165,7 @@ class MujocoTask(BaseTask):
         for _ in range(ATTEMPTS):
             world.attach()
             self.prepare(world)
+            world.check_places()
             world.begin(observation, info)
             goal = np.asarray(self.goal(world))
             if goal.shape != (3,) or not np.isfinite(goal).all():
@@ -189,10 +194,8 @@ class MujocoTask(BaseTask):
 
     def step(self, worlds: Sequence[MujocoWorld], actions: Sequence[np.ndarray]) -> None:
         """Simulate one control step of every world with its action ``[A]``, cut to the limits."""
+        actions = [check_action(action, len(self.action)) for action in actions]
         for world, action in zip(worlds, actions, strict=True):
-            action = np.asarray(action, dtype=np.float32)
-            if action.shape != (len(self.action),) or not np.isfinite(action).all():
-                raise ValueError(f"an action must be {len(self.action)} finite numbers, got {action}")
             world.step(action.clip(-self.action_limit, self.action_limit))
             world.position_error = self.distance(world)
             world.solved |= self.is_solved(world)

@@ -48,6 +48,25 @@ class MujocoWorld:
             self.reader = BodyReader(self.model, self.bodies)
             self.renderer: FrameRenderer | None = None
 
+    def check_places(self) -> None:
+        """Check that everything is drawn where the model has it, relative to its body.
+
+        Raises:
+            ValueError: a site or geom is not.
+        """
+        for kind, objects in (("site", mujoco.mjtObj.mjOBJ_SITE), ("geom", mujoco.mjtObj.mjOBJ_GEOM)):
+            body = getattr(self.model, f"{kind}_bodyid")
+            turn = self.data.xmat[body].reshape(-1, 3, 3)
+            place = self.data.xpos[body] + (turn @ getattr(self.model, f"{kind}_pos")[..., None])[..., 0]
+            gap = np.abs(place - getattr(self.data, f"{kind}_xpos")).max(1, initial=0)
+            for i in np.flatnonzero(gap > 1e-6):
+                name = mujoco.mj_id2name(self.model, objects, i)
+                raise ValueError(
+                    f"the {kind} {name!r} has been moved but is drawn {1000 * gap[i]:.0f} mm away; call mj_forward in prepare, "
+                    f"and give the {kind} a pos in the XML, as MuJoCo ignores later ones of what is compiled at the origin of "
+                    "its body"
+                )
+
     def begin(self, observation: Any, info: dict) -> None:
         """Forget the last episode, after a reset of the environment."""
         self.observation, self.info, self.reward = observation, info, 0.0
@@ -65,6 +84,8 @@ class MujocoWorld:
         time, before = self.data.time, self.velocity
         self.observation, reward, _, _, self.info = self.env.step(action)
         self.reward, self.steps = float(reward), self.steps + 1
+        if not np.isfinite(self.reward):
+            raise ValueError(f"the environment's reward must be finite, got {reward} in step {self.steps}")
         self.position, self.velocity = self.reader.read(self.data)
         finite = np.isfinite(self.position).all() and np.isfinite(self.velocity).all()
         if not finite or self.data.warning.number[UNSTABLE].any():  # MuJoCo may have reset its data meanwhile
