@@ -184,6 +184,16 @@ def test_a_full_disk_or_a_lost_worker_is_one_clear_error(tmp_path, monkeypatch, 
         record_dataset(tmp_path / "d", episodes=1, eval_episodes=1, workers=1)
 
 
+def test_a_mistake_before_the_first_episode_leaves_no_folder(tmp_path, monkeypatch):
+    def fail(*_):
+        raise ValueError("a mistake")
+
+    monkeypatch.setattr(module, "_run_shards", fail)
+    with pytest.raises(ValueError, match="a mistake"):
+        record_dataset(tmp_path / "d", "balance_reaching", episodes=2, eval_episodes=1, workers=1)
+    assert not any(tmp_path.iterdir())
+
+
 def test_an_expert_that_reads_other_states_is_refused(tmp_path):
     """The states of tasks 2 and 3 have the same number of entries."""
     for task, expert in (("bin_dropping", "balance_reaching_obstacle"), ("balance_reaching", "bin_dropping")):

@@ -76,6 +76,10 @@ def record_dataset(
             if not (root / META).exists():
                 _record(root, parts, settings, workers, launcher)
             shutil.rmtree(parts)
+    except ValueError:  # a mistake in the task
+        if not _has_episodes(parts):
+            shutil.rmtree(parts)
+        raise
     except Timeout as error:
         raise ValueError(
             f"{root} is being recorded by another process; wait for that process or stop it"
@@ -129,10 +133,11 @@ def _stored_settings(root: Path) -> dict | None:
             f"{root} must be a recording or a new folder, got something else; choose another folder or delete it"
         )
     parts = parts_folder(root)
-    started = any(
-        path.is_dir() and path.suffix != ".tmp" for path in parts.glob("*")
-    )  # an episode is complete
-    return read_json(parts / "settings.json") if started else None
+    return read_json(parts / "settings.json") if _has_episodes(parts) else None
+
+
+def _has_episodes(parts: Path) -> bool:
+    return any(path.is_dir() and path.suffix != ".tmp" for path in parts.glob("*"))
 
 
 def _record(root: Path, parts: Path, settings: dict, workers: int, launcher: str) -> None:
