@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
+from numbers import Integral
 
 import torch
 from torch import nn
@@ -44,7 +45,7 @@ class WorldModel(nn.Module):
         cameras: number of cameras, whose frames stand side by side; each has an encoder and a decoder of its own.
 
     Raises:
-        ValueError: the architecture is unknown, or the frames have another size.
+        ValueError: the architecture is unknown, or a size is wrong.
     """
 
     def __init__(
@@ -60,12 +61,13 @@ class WorldModel(nn.Module):
         super().__init__()
         if architecture not in ARCHITECTURES:
             raise ValueError(f"architecture must be one of {', '.join(ARCHITECTURES)}, got {architecture!r}")
-        if image_size < 8 or image_size % 8 or cameras < 1:
-            raise ValueError(
-                f"frames must have a side that is a multiple of 8 and at least one camera, got {image_size} and {cameras}"
-            )
         self.latent_size, self.hidden_size, self.architecture = latent_size, hidden_size, architecture
         self.image_size, self.cameras = image_size, cameras
+        for name in ("latent_size", "hidden_size", "image_size", "cameras"):
+            if not isinstance(size := getattr(self, name), Integral) or size < 1:
+                raise ValueError(f"{name} must be a whole number of at least 1, got {size}")
+        if image_size % 8:
+            raise ValueError(f"image_size must be a multiple of 8, got {image_size}")
         encoder, decoder = ARCHITECTURES[architecture]
         encoders = [encoder(latent_size, image_size=image_size) for _ in range(cameras)]
         self.encoder = encoders[0] if cameras == 1 else CameraEncoders(encoders, image_size)

@@ -69,10 +69,20 @@ def test_glimpses_and_sprites_cover_the_same_part_of_larger_frames():
     assert (torch.nn.functional.avg_pool2d(large, 2) - small)[..., 24:40, 24:40].abs().mean() < 0.1
 
 
-@pytest.mark.parametrize(("size", "cameras"), [(60, 1), (0, 1), (64, 0)])
-def test_sizes_that_do_not_fit_are_refused(size, cameras):
-    with pytest.raises(ValueError, match="multiple of 8"):
-        make(image_size=size, cameras=cameras)
+@pytest.mark.parametrize(
+    "size",
+    [
+        {"image_size": 60},
+        {"image_size": 0},
+        {"image_size": 96.0},
+        {"cameras": 0},
+        {"latent_size": 0},
+        {"hidden_size": 1.5},
+    ],
+)
+def test_sizes_that_cannot_be_are_refused(size):
+    with pytest.raises(ValueError, match=f"{next(iter(size))} must be"):
+        make_world_model(CONSTANTS, ("position",), **size)
 
 
 @torch.no_grad()
