@@ -79,9 +79,9 @@ def test_what_the_policy_reads_is_what_imitating_policies_read(world_model):
     class Replay(torch.nn.Module):
         seen = []
 
-        def step(self, latent, hidden1, hidden2, goal, state):
+        def forward(self, latent, hidden1, hidden2, goal):
             self.seen.append(torch.cat([latent, hidden1, hidden2, goal], -1))
-            return next(actions), state
+            return next(actions)
 
     replay = Replay()
     roll_out_actor(Actor(model, replay, mixed=True), "balance_reaching", [3, 4])

@@ -30,7 +30,7 @@ def write(folder, episodes, **options):
 
 
 def test_errors_are_means_over_seeds_beside_those_of_the_best_constant(folder, monkeypatch):
-    described, drawn = {"names": NAMES, "info": {"fps": 10}}, []
+    described, drawn = {"names": NAMES, "info": {"fps": 10}, "cameras": ["top"]}, []
     monkeypatch.setattr(robot_page, "describe_robot_dataset", lambda *_: described)
     monkeypatch.setattr("dynmap_rl.reporting.figures.plot_reconstruction", lambda *_, dt: drawn.append(dt))
     episodes = make_episodes()["eval"].set("episode", torch.tensor([4, 4, 7])[:, None, None].expand(3, 12, 1))
@@ -55,7 +55,7 @@ def test_errors_are_means_over_seeds_beside_those_of_the_best_constant(folder, m
 
 
 def test_an_entry_that_was_not_found_in_the_held_out_episodes_is_not_known(folder, monkeypatch):
-    described = {"names": NAMES, "info": {"fps": 10}}
+    described = {"names": NAMES, "info": {"fps": 10}, "cameras": ["top"]}
     monkeypatch.setattr(robot_page, "describe_robot_dataset", lambda *_: described)
     monkeypatch.setattr("dynmap_rl.reporting.figures.plot_reconstruction", lambda *_, dt: None)
     path = folder / "seed_1/eval.json"
