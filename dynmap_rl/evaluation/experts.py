@@ -66,18 +66,12 @@ def judge_demonstrator(task: BaseTask, seeds: Iterable[int]) -> dict[str, list[b
         ``success`` and ``dropped`` at the end of the episode of each scene.
     """
     world, outcomes = None, {"success": [], "dropped": []}
+    size, what = len(task.layout.action), f"an action of the demonstrator of {task.name}"
     for seed in seeds:
         world = task.begin(seed, world=world)
         act = task.demonstrator(world)
         for _ in range(task.layout.steps):
-            task.step(
-                [world],
-                [
-                    check_action(
-                        act(), len(task.layout.action), f"an action of the demonstrator of {task.name}"
-                    )
-                ],
-            )
+            task.step([world], [check_action(act(), size, what)])
         outcomes["success"].append(task.is_success(world))
         outcomes["dropped"].append(world.dropped)
     return outcomes

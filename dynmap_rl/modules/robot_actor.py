@@ -114,7 +114,8 @@ class RobotActor:
     def act(self, now: float) -> np.ndarray:
         """Return the action of the control step that begins now, float32 ``[A]`` (SI units).
 
-        It is cut to the range of the actions in the demonstrations.
+        It is cut to the range of the demonstrations' actions: the limits of a task, or, for a robot dataset, all but one in a
+        thousand of the values at either end.
 
         Raises:
             ValueError: no frame has arrived before the first action, ``now`` is not finite or not after the last call, a

@@ -182,10 +182,8 @@ class Session:
 
     def _expert_action(self) -> np.ndarray:
         if self.demonstrate:
-            size = len(self.env.layout.action)
-            return check_action(
-                self.demonstrate(), size, f"an action of the demonstrator of {self.task.name}"
-            )
+            what = f"an action of the demonstrator of {self.task.name}"
+            return check_action(self.demonstrate(), len(self.env.layout.action), what)
         state = torch.from_numpy(self.expert_task.state(self.world))
         return self.world.action_for(self.expert(state)[0].numpy())
 

@@ -114,10 +114,8 @@ def fit(
     loss_module = share_gradients(loss_module, some=unused)
     part = slice(rank(), None, ranks())
     bar = {"initial": start} | ({"disable": True} if rank() else {})  # False would override TQDM_DISABLE
-    progress, clock = (
-        tqdm(range(start, settings.updates), folder.name, settings.updates, **bar),
-        time.monotonic(),
-    )
+    progress = tqdm(range(start, settings.updates), folder.name, settings.updates, **bar)
+    clock = time.monotonic()
     for update in progress:
         set_learning_rate(optimizer, settings.learning_rate, update, settings.updates)
         batch, length = windows_at(settings, update)

@@ -88,14 +88,13 @@ def _demonstrate(
         }
         row |= {f"dynamics.{name}": getattr(world, name).astype(np.float32) for name in DYNAMICS}
         try:
-            action = np.asarray(expert(), np.float32)
+            action = expert()
         except StopIteration as error:
             raise ValueError(
                 f"the demonstrator of {rules.name} must act in every step, but ends in step {t}"
             ) from error
-        check_action(
-            action, len(limit), f"an action of the demonstrator of {rules.name} (step {t}, scene {seed})"
-        )
+        what = f"an action of the demonstrator of {rules.name} (step {t}, scene {seed})"
+        action = check_action(action, len(limit), what)
         change = noise * rng.standard_normal(len(limit)).astype(np.float32) * limit
         change = change * (not getattr(expert, "exact", False))
         row |= {"action": (action + change).clip(-limit, limit), "expert_action": action.clip(-limit, limit)}
