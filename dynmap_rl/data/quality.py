@@ -7,6 +7,7 @@ positions with one known fault from those without (``tests/data/test_quality.py`
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -101,8 +102,8 @@ def judge_quality(derived: Sequence[Derived]) -> dict:
     Returns:
         JSON values: ``verdict``, ``good`` or ``doubtful`` (a check fails); ``checks``, a dict by the names of
         :data:`LIMITS` of those that the source allows, each with ``value`` (of the worst object or entry), ``limit``,
-        ``good``, ``where`` (that object or entry), ``episode`` (the worst one), ``what`` and ``advice``; ``jumps`` and
-        ``order`` also with all ``episodes`` that fail.
+        ``good``, ``where`` (that object or entry), ``episode`` (the worst one), ``episodes`` (all that are beyond the
+        limit by themselves), ``what`` and ``advice``.
     """
     rows: dict[int, dict] = {}  # values by check and place, by episode
     steps = {part.episode: len(part.position) for part in derived}
@@ -139,9 +140,8 @@ def judge_quality(derived: Sequence[Derived]) -> dict:
             "what": what,
             "advice": advice,
         }
-        if name in BY_EPISODE:
-            own = {e: row[name][where] for e, row in rows.items() if row.get(name)}
-            checks[name]["episodes"] = [episode for episode, value in own.items() if value]
+        own = {e: row[name][where] for e, row in rows.items() if row.get(name)}
+        checks[name]["episodes"] = [e for e, value in own.items() if sign * value > sign * limit]
     good = all(check["good"] for check in checks.values())
     return {"verdict": "good" if good else "doubtful", "checks": checks}
 
@@ -173,8 +173,9 @@ def _in_episodes(check: dict, most: int = 20) -> str:
 def _extents(derived: Sequence[Derived]) -> dict[str, float]:
     """Return the mean extent of every entry over the episodes, without the switches.
 
-    Entries of a state may have different units; those that are found in the frames have one, and share the largest. A
-    switch is an entry with two values, such as a gripper that is open or closed, which may jump.
+    Entries of a state may have different units; x, y and z of one body have one, as have all entries that are found in
+    the frames, and share the largest extent. A switch is an entry with two values, such as a gripper that is open or
+    closed, which may jump.
     """
     extents, values = {}, {}
     for part in derived:
@@ -184,7 +185,11 @@ def _extents(derived: Sequence[Derived]) -> dict[str, float]:
         for name, own, column in zip(part.names, extent, part.position.T, strict=True):
             extents.setdefault(name, []).append(own)
             values[name] = np.unique(np.append(values.get(name, []), column))[:3]
-    return {name: float(np.mean(some)) for name, some in extents.items() if len(values[name]) > 2}
+    means = {name: float(np.mean(some)) for name, some in extents.items() if len(values[name]) > 2}
+    bodies = {name: re.sub("[xyz]$", "", name) for name in means}
+    return {
+        name: max(means[other] for other in means if bodies[other] == body) for name, body in bodies.items()
+    }
 
 
 def _measure(episode: Derived, extents: dict[str, float]) -> dict[str, dict[str, float]]:

@@ -79,7 +79,7 @@ def check_policy(kind: str) -> None:
         raise ValueError(f"the kind of a policy must be one of {', '.join(sorted(POLICIES))}, got {kind!r}")
 
 
-def save_world_model(folder: Path, model: WorldModel) -> None:
+def save_world_model(folder: str | Path, model: WorldModel) -> None:
     """Write weights and sizes of a world model to a folder.
 
     Raises:
@@ -104,7 +104,7 @@ def save_world_model(folder: Path, model: WorldModel) -> None:
     write_json(Path(folder) / "arguments.json", arguments)
 
 
-def load_world_model(folder: Path) -> WorldModel:
+def load_world_model(folder: str | Path) -> WorldModel:
     """Load a world model, in evaluation mode.
 
     Raises:
@@ -128,7 +128,9 @@ def load_world_model(folder: Path) -> WorldModel:
     return load_module(Path(folder) / "weights.safetensors", make).eval()
 
 
-def save_policy(folder: Path, policy: FeedforwardPolicy | RecurrentPolicy, world_model: WorldModel) -> None:
+def save_policy(
+    folder: str | Path, policy: FeedforwardPolicy | RecurrentPolicy, world_model: WorldModel
+) -> None:
     """Write weights, kind and sizes of a policy to a folder.
 
     Args:
@@ -156,7 +158,7 @@ def save_policy(folder: Path, policy: FeedforwardPolicy | RecurrentPolicy, world
     write_json(Path(folder) / "arguments.json", arguments)
 
 
-def load_policy(folder: Path) -> FeedforwardPolicy | RecurrentPolicy:
+def load_policy(folder: str | Path) -> FeedforwardPolicy | RecurrentPolicy:
     """Load a policy, in evaluation mode.
 
     Raises:
@@ -174,7 +176,7 @@ def load_policy(folder: Path) -> FeedforwardPolicy | RecurrentPolicy:
     return load_module(Path(folder) / "weights.safetensors", make).eval()
 
 
-def _read_arguments(folder: Path) -> dict:
+def _read_arguments(folder: str | Path) -> dict:
     path = Path(folder) / "arguments.json"
     if not path.exists():
         raise ValueError(f"no checkpoint in {folder} (no arguments.json); check the path, or train one")

@@ -118,6 +118,17 @@ def test_entries_of_a_state_have_units_of_their_own():
     assert found["checks"]["residual"]["where"] == "x" and found["verdict"] == "doubtful"
 
 
+def test_a_coordinate_that_hardly_moves_is_judged_by_the_extent_of_its_body():
+    noise = 1e-3 * np.random.default_rng(0).standard_normal(120)
+    position = np.stack([POSES[:, 0, 0], noise], 1)  # m: a hand that stays at its height
+
+    def verdict(names):
+        return judge_quality([Derived(0, names, position, position, Motion(position, []))])["verdict"]
+
+    assert verdict(["hand_x", "hand_z"]) == "good"
+    assert verdict(["hand_x", "grip"]) == "doubtful"
+
+
 def test_a_joint_that_rests_in_one_episode_is_no_fault():
     noise = 1e-4 * np.random.default_rng(0).standard_normal((120, 1))
     moves, rests = POSES[:, 0, :1], POSES[:1, 0, :1] + noise
@@ -220,7 +231,8 @@ def test_angles_in_degrees_are_judged_like_those_in_radians():
 def test_noise_of_positions_is_measured():
     """The smooth trajectory follows a part of the noise: three of the seven steps of its window are free."""
     position = POSES.reshape(120, 6)
-    extent = np.ptp(np.quantile(position, [0.05, 0.95], axis=0)[:, [0, 1, 3, 4]], axis=0).min()
+    extents = np.ptp(np.quantile(position, [0.05, 0.95], axis=0)[:, [0, 1, 3, 4]], axis=0)
+    extent = extents.reshape(2, 2).max(1).min()  # x and y of an object share the larger one
     noisy = position + 0.005 * np.random.default_rng(1).standard_normal(position.shape)
     assert judge_state(noisy)["residual"]["value"] * extent == pytest.approx(0.005 * (4 / 7) ** 0.5, rel=0.25)
 
