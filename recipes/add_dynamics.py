@@ -115,7 +115,9 @@ def main(config: Config) -> None:
         entries = ", ".join(f"{value:.3g}" for value in difference)
         lines.append(f"mean absolute difference from the replaced {quantity}: {entries}")
     if config.source == "state":
-        lines.append("the verdict is on the state alone; --source state,tracks adds objects that are seen in the frames")
+        lines.append(
+            "the verdict is on the state alone; --source state,tracks adds objects that are seen in the frames"
+        )
     text = "\n".join([quality_text(found["quality"]), *lines])
     if found["view"]:
         text = f"frames of {found['view'].column}\n{text}"

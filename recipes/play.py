@@ -117,6 +117,7 @@ def main(config: Config) -> None:
         play(config, task, session, window, frames, layout.dt)
     finally:
         window.close()
+        session.env.close()
         count = len(list_shards(config.record, task)) if config.record else 0
         if count > max(published, 1):
             print(f"{count} episodes: {publish_episodes(config.record, task)}")

@@ -93,9 +93,14 @@ def load_dataset(dataset: str | Path, split: str | None = None, cache: Path | No
         raise ValueError(
             f"split {split} of {root} must have an episode, got none; restore its meta/info.json"
         )
+    return _select(episodes, rows)
+
+
+def _select(episodes: TensorDict, rows: list[int]) -> TensorDict:
+    """Return rows of the cache: a view where they follow each other, otherwise a copy, as a tensor is mapped as a whole."""
     if rows == list(range(rows[0], rows[-1] + 1)):
         return episodes[rows[0] : rows[-1] + 1]
-    return episodes[rows]  # a copy, as a tensor is mapped as a whole
+    return episodes[rows]
 
 
 def load_demonstrations(dataset: str | Path, cache: Path | None = None) -> tuple[dict[str, TensorDict], dict]:
@@ -121,9 +126,8 @@ def load_demonstrations(dataset: str | Path, cache: Path | None = None) -> tuple
     parts = _open(root, info, meta, cache)
     index = parts["episode"][:, 0].tolist()
     splits = choose_splits(root, info, sorted(index))
-    episodes, start = {}, 0
-    for name, members in splits.items():  # in the order of the cache
-        episodes[name], start = parts[start : start + len(members)], start + len(members)
+    rows = {episode: row for row, episode in enumerate(index)}
+    episodes = {name: _select(parts, [rows[e] for e in members]) for name, members in splits.items()}
     return episodes, meta["normalization"] if meta else normalization_constants(episodes["train"])
 
 

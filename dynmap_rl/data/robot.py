@@ -62,7 +62,7 @@ def describe_robot_dataset(
     views = [name.strip() for name in camera.split(",")] if camera else [None]
     columns = {"action": "action"} | {q: f"dynamics.{q}" for q in DYNAMICS if f"dynamics.{q}" in features}
     views = [choose_camera(root, info, name) for name in views]
-    goal = _check_goal(root, info, goal)
+    goal = _check_goal(info, goal)
     rows = spans(read_table(root, info, [])["episode_index"].to_numpy())
     lengths = {episode: span.stop - span.start for episode, span in rows}
     usable = [episode for episode, length in lengths.items() if length >= min_steps]
@@ -187,7 +187,7 @@ def _read_numbers(layout: dict) -> tuple[dict, dict[int, slice]]:
     return numbers, dict(spans(table["episode_index"].to_numpy()))
 
 
-def _check_goal(root: Path, info: dict, goal: str | None) -> tuple[str, list[int]] | None:
+def _check_goal(info: dict, goal: str | None) -> tuple[str, list[int]] | None:
     if goal is None:
         return None
     column, _, text = goal.rpartition(":")

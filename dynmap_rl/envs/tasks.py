@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import inspect
 import math
 import re
 import sys
@@ -210,8 +211,6 @@ class BinDropping(Task):
 
 
 TASKS = {task.name: task for task in (BalanceReaching(), BalanceReachingObstacle(), BinDropping())}
-
-
 MUJOCO = "mujoco"  # short name of the module of the MuJoCo tasks
 MUJOCO_MODULE = "dynmap_rl.envs.mujoco"
 
@@ -271,7 +270,8 @@ def _make_task(name: str, from_file: bool) -> BaseTask:
         made = task(**(_parse_arguments(rest[0]) if rest else {}))
     except (TypeError, ValueError) as error:
         what = f"the arguments of the task {name!r} are" if rest else f"the task {name!r} is"
-        raise ValueError(f"{what} wrong ({error})") from error
+        known = ", ".join(inspect.signature(task).parameters) or "none"
+        raise ValueError(f"{what} wrong ({error}); it takes {known}") from error
     if rest:
         try:
             made.name = re.sub("[^a-z0-9]+", "_", f"{made.name}_{rest[0].lower()}")

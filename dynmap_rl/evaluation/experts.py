@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+import numpy as np
+
 from dynmap_rl.envs.geometry import path_is_blocked, way_from_start
 from dynmap_rl.envs.protocol import BaseTask, check_action
 from dynmap_rl.envs.scene import ObstacleScene, scene_seeds
@@ -66,14 +68,19 @@ def judge_demonstrator(task: BaseTask, seeds: Iterable[int]) -> dict[str, list[b
         ``success`` and ``dropped`` at the end of the episode of each scene.
     """
     world, outcomes = None, {"success": [], "dropped": []}
-    size, what = len(task.layout.action), f"an action of the demonstrator of {task.name}"
-    for seed in seeds:
-        world = task.begin(seed, world=world)
-        act = task.demonstrator(world)
-        for _ in range(task.layout.steps):
-            task.step([world], [check_action(act(), size, what)])
-        outcomes["success"].append(task.is_success(world))
-        outcomes["dropped"].append(world.dropped)
+    limit, what = np.array(task.layout.action_limit), f"an action of the demonstrator of {task.name}"
+    try:
+        for seed in seeds:
+            world = task.begin(seed, world=world)
+            act = task.demonstrator(world)
+            for _ in range(task.layout.steps):
+                action = check_action(act(), len(limit), what)
+                task.step([world], [np.clip(action, -limit, limit)])  # as recordings do
+            outcomes["success"].append(task.is_success(world))
+            outcomes["dropped"].append(world.dropped)
+    finally:
+        if world is not None:
+            task.close(world)
     return outcomes
 
 

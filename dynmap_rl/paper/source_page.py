@@ -13,7 +13,7 @@ from .results import count_devices
 from .source_results import (
     MEASURES,
     data_table,
-    find_repeated,
+    find_unmeasured,
     gap_table,
     plot_data,
     plot_measures,
@@ -28,6 +28,10 @@ from .tables import commits_text, devices_text, join_table, p_text
 REPEATED = (
     "The world models of these runs were trained again between their recurrent and their feed-forward policies, and only the "
     "training that was measured is in the figures of measures: {}."
+)
+DATA = (
+    "Bands in the figure are the 95 % intervals over the test scenes, for the world models that there are: one, or as many as "
+    "rates stand in brackets here and as small dots in the figure. Each policy of End-to-End has a world model of its own."
 )
 FORMS = {"glimpse": "the default encoder and decoder", "plain": "a plain CNN"}
 
@@ -53,7 +57,7 @@ def write_source_page(results: Path, tasks: list[str], architecture: str = "glim
         "sources are one recording with different noise, so that p is too small. A verdict names the checks that failed. Written by "
         "`recipes/paper/sources.py --write`.",
     ]
-    written, repeated = [], find_repeated(results)
+    written, repeated = [], find_unmeasured(results)
     for task in tasks:
         if not any(read_source(results, task, source, policy) for source in SOURCES for policy in POLICIES):
             continue
@@ -73,7 +77,12 @@ def write_source_page(results: Path, tasks: list[str], architecture: str = "glim
             parts.append(join_table(["policy", "measure", "rank correlation with SR", "p", "sources"], rows))
     written.append(results / "data.png")
     plot_data(results, "balance_reaching", written[-1])
-    parts += ["## Number of demonstrations", data_table(results, "balance_reaching"), "![data](data.png)"]
+    parts += [
+        "## Number of demonstrations",
+        DATA,
+        data_table(results, "balance_reaching"),
+        "![data](data.png)",
+    ]
     parts += [REPEATED.format(", ".join(f"`{name}`" for name in repeated))] if repeated else []
     found = [read_json(path) for path in sorted(results.glob("*.json"))]
     commits = commits_text(Counter(result["commit"] for result in found))

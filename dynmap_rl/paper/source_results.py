@@ -207,7 +207,7 @@ def measured_points(results: Path, task: str, policy: str) -> tuple[list, list, 
         for seed in WORLD_MODELS:
             path = results / f"{name_run(task, source, seed, policy)}.json"
             measured = results / "measures" / f"{name_run(task, source, seed, 'recurrent')}.json"
-            if path.exists() and measured.exists() and not _is_repeated(path):
+            if path.exists() and measured.exists() and not _is_unmeasured(path):
                 rows = [row for of_seed in result_rows(read_json(path)) for row in of_seed]
                 found = read_json(measured)
                 pairs.append([summarize(rows)["SR"], *(found[name] for name in MEASURES)])
@@ -218,16 +218,16 @@ def measured_points(results: Path, task: str, policy: str) -> tuple[list, list, 
     return names, rates, dict(zip(MEASURES, values, strict=True))
 
 
-def find_repeated(results: Path) -> list[str]:
+def find_unmeasured(results: Path) -> list[str]:
     """Return the runs whose frozen world model is not the one that was measured under its name.
 
     That is so where a world model was trained again, between its recurrent and its feed-forward policies. Measures that
     name no world model are of the recurrent policies' one.
     """
-    return [path.stem for path in sorted(results.glob("*_world_model_*.json")) if _is_repeated(path)]
+    return [path.stem for path in sorted(results.glob("*_world_model_*.json")) if _is_unmeasured(path)]
 
 
-def _is_repeated(path: Path) -> bool:
+def _is_unmeasured(path: Path) -> bool:
     name = f"{path.stem.rpartition('_')[0]}_recurrent.json"
     owners = [read_json(p) for p in (path.parent / "measures" / name, path.parent / name) if p.exists()]
     owner = next((o["world_model_sha256"] for o in owners if o.get("world_model_sha256")), None)
@@ -263,6 +263,8 @@ def plot_data(results: Path, task: str, path: Path) -> None:
             [line] = axis.plot(list(cells), [cell["SR"] for cell in cells.values()], marker=".", label=text)
             low, high = zip(*(cell["interval"] for cell in cells.values()), strict=True)
             axis.fill_between(list(cells), low, high, color=line.get_color(), alpha=0.15, lw=0)
+            for size, cell in cells.items():
+                axis.plot([size], [cell["world_models"]], ".", ms=3, color=line.get_color())
     axis.set_xscale("log")
     axis.set_xticks(SIZES, map(str, SIZES))
     axis.minorticks_off()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict, deque
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -139,7 +140,7 @@ class Session:
         seeds = torch.tensor([scene_seed(self.split, self.seed)])
         self.td = self.env.reset(TensorDict({"scene_seed": seeds}, [1]))
         self.scene_seed, self.imagining = int(seeds), False
-        self.demonstrate = self.task.demonstrator(self.world)
+        self.demonstrate: Callable | None = None
         self.drove: set[str] = set()
         self.steps: list[TensorDict] = []
         self.trace = defaultdict(list)
@@ -154,6 +155,8 @@ class Session:
         if self.over:
             return
         self.drove.add(self.driver)
+        if self.driver != "expert":
+            self.demonstrate = None  # it plans anew when it takes over
         seen = self._act()
         actions = {
             "person": self._person_action,
@@ -181,7 +184,8 @@ class Session:
         return self.person.action(self.world.commanded, self.world.action)
 
     def _expert_action(self) -> np.ndarray:
-        if self.demonstrate:
+        if self.task.has_demonstrator:
+            self.demonstrate = self.demonstrate or self.task.demonstrator(self.world)
             what = f"an action of the demonstrator of {self.task.name}"
             return check_action(self.demonstrate(), len(self.env.layout.action), what)
         state = torch.from_numpy(self.expert_task.state(self.world))

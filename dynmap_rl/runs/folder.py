@@ -100,9 +100,11 @@ def plain_settings(config) -> dict:
 
 
 def append_metrics(folder: Path, step: int, **metrics: float) -> None:
-    """Append one line to ``metrics.jsonl``, without metrics that are NaN."""
+    """Append one line to ``metrics.jsonl``, without metrics that are NaN or infinite, which JSON lacks."""
     numbers = {name: _to_number(value) for name, value in metrics.items()}
-    known = {name: number for name, number in numbers.items() if number == number}  # JSON has no NaN
+    known = {
+        k: number for k, number in numbers.items() if not isinstance(number, float) or math.isfinite(number)
+    }
     line = json.dumps({"step": step, **known})
     Path(folder).mkdir(parents=True, exist_ok=True)
     with open(Path(folder) / "metrics.jsonl", "a") as file:

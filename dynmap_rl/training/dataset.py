@@ -122,13 +122,14 @@ def check_start(dataset: str | Path, task: str) -> None:
     seeds = {row["episode_index"]: row.get("scene_seed") for row in meta["episodes"]}
     if (seed := seeds.get(first[0][0])) is None:
         return
-    world = rules.begin(seed)
     recorded = read_column(root, info, columns, "observation.state")[
         columns["episode_index"].to_numpy() == first[0][0]
     ]
-    drawn, frame = rules.make_renderer()(world), np.concatenate([frames[0] for _, frames, _ in first], 1)
+    frame, world = np.concatenate([frames[0] for _, frames, _ in first], 1), rules.begin(seed)
+    drawn, state = np.array(rules.make_renderer()(world)), np.array(rules.agent_pos(world))
+    rules.close(world)
     wrong = {
-        "state": not np.allclose(recorded[0], rules.agent_pos(world), atol=1e-3),
+        "state": not np.allclose(recorded[0], state, atol=1e-3),
         "frame": (np.abs(frame.astype(int) - drawn).max(-1) > LEVEL).mean() > (0 if rules.planar else SHARE),
     }
     if name := next((name for name, found in wrong.items() if found), None):

@@ -109,8 +109,6 @@ def train_ppo(
     if state := load_training_state(state_path):
         if "networks" not in state:
             raise ValueError(f"{state_path} is of an earlier release; choose another --run")
-        networks.load_state_dict(state["networks"])
-        optimizer.load_state_dict(state["optimizer"])
         start, seconds = state["iteration"], state["seconds"]
         if compare_settings(state.get("form", plain_settings(form)), form):
             raise ValueError(f"{state_path} is of a training with other settings; choose another --run")
@@ -118,6 +116,11 @@ def train_ppo(
             raise ValueError(
                 f"PPOTraining.iterations must be at least the {start} of {state_path}, got {settings.iterations}"
             )
+        try:
+            networks.load_state_dict(state["networks"])
+        except RuntimeError as error:
+            raise ValueError(f"{state_path} is of a network of another size; choose another --run") from error
+        optimizer.load_state_dict(state["optimizer"])
     truncate_metrics(folder, start)
 
     frames = settings.num_envs * settings.steps

@@ -20,8 +20,8 @@ def write_json(path: Path, value) -> None:
 def write_bytes(path: Path, data: bytes) -> None:
     """Write a file under a temporary name, then rename it.
 
-    The file is complete or unchanged at any moment. A temporary file that a kill leaves behind is overwritten by the
-    next write.
+    The file is complete or unchanged at any moment, as long as one process at a time writes it. A temporary file that a
+    kill leaves behind is overwritten by the next write.
     """
     path = Path(path)
     if path.is_dir():

@@ -58,7 +58,8 @@ def leave_ranks() -> int:
     if ranks() > 1:
         from torch import distributed
 
-        distributed.barrier()
+        with translate_errors():
+            distributed.barrier()
         distributed.destroy_process_group()
     return number
 

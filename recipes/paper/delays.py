@@ -103,7 +103,7 @@ def open_result(config: Config, run: str, condition: str) -> tuple[Path, dict]:
         raise ValueError(f"--runs must be runs or policies, got {run}; train one with recipes/decoupled.py")
     task = config.task or task_of_run(folder) or "balance_reaching"
     name = get_task(task, from_file=not config.task).name
-    name = "_".join([name, *Path(run).parts[-4:], f"seed_{config.seed}", condition])
+    name = "_".join([name, *Path(run).parts[-4:], f"seed_{config.seed}", condition]).replace("/", "")
     path = config.results / f"{name}.json"
     facts = {"run": run, "seed": config.seed, "task": task, "condition": condition}
     facts |= {"split": config.eval.split, "episodes": config.eval.episodes}

@@ -170,3 +170,11 @@ def test_an_entry_may_be_larger_than_memory(tmp_path):
     assert mapped["action"].shape == (1, 1, size) and mapped["action"][0, 0, -1] == 0
     mapped["action"][0, 0, -1] = 7  # stays in the process
     assert _map(tmp_path / "entry")["action"][0, 0, -1] == 0
+
+
+def test_splits_are_found_in_a_cache_of_another_order(copy, monkeypatch):
+    load_demonstrations(copy)
+    monkeypatch.setattr(demonstrations, "choose_splits", lambda *_: {"train": [2, 3], "eval": [0, 5]})
+    parts, _ = load_demonstrations(copy)
+    assert parts["train"]["episode"][:, 0].tolist() == [2, 3]
+    assert parts["eval"]["episode"][:, 0].tolist() == [0, 5]

@@ -224,7 +224,7 @@ def test_late_frames_and_chunks(recording, kind, tmp_path):
         ({"hidden_size": -3}, "hidden_size"),
         ({"width": -4}, "width"),
         ({"optimizer_lr": -1.0}, "optimizer_lr"),
-        ({"rarity": 2.0}, "rarity"),
+        ({"rarity": -1.0}, "rarity"),
     ],
 )
 def test_wrong_settings_are_refused(settings, message):

@@ -8,7 +8,7 @@ from dynmap_rl.evaluation.statistics import welch_interval
 from dynmap_rl.modules.checkpoints import make_world_model
 from dynmap_rl.paper import source_results
 from dynmap_rl.paper.source_results import (
-    find_repeated,
+    find_unmeasured,
     gap_table,
     measure_world_model,
     measured_points,
@@ -124,10 +124,10 @@ def test_policies_on_another_training_of_a_world_model_are_not_paired_with_its_m
     measures = dict.fromkeys(("probe_position", "probe_velocity", "open_loop_mm"), 0.5)
     for measured in (measures, measures | {"world_model_sha256": "a"}):
         write_json(tmp_path / "measures" / f"{name}_recurrent.json", measured)
-        assert find_repeated(tmp_path) == [f"{name}_feedforward"]
+        assert find_unmeasured(tmp_path) == [f"{name}_feedforward"]
         halves = {key: [0.5] for key in measures}
         assert measured_points(tmp_path, "balance_reaching", "recurrent") == (["tracks"], [60.0], halves)
         none = {key: [] for key in measures}
         assert measured_points(tmp_path, "balance_reaching", "feedforward") == ([], [], none)
     write_json(tmp_path / "measures" / f"{name}_recurrent.json", measures | {"world_model_sha256": "b"})
-    assert find_repeated(tmp_path) == [f"{name}_recurrent"]
+    assert find_unmeasured(tmp_path) == [f"{name}_recurrent"]

@@ -8,7 +8,7 @@ from tensordict import TensorDict
 
 from dynmap_rl.envs.delay import FrameDelay
 from dynmap_rl.envs.scene import scene_seed
-from dynmap_rl.envs.tasks import TASKS
+from dynmap_rl.envs.tasks import TASKS, BalanceReaching
 from dynmap_rl.envs.torchrl_env import DynmapBatchedEnv
 from dynmap_rl.evaluation.rollout import roll_out
 from dynmap_rl.modules.actor import MEMORY, Actor
@@ -40,6 +40,21 @@ def test_the_expert_succeeds_and_its_episode_is_a_demonstration(task):
     for t in range(120):
         assert torch.equal(td["dynamics", "position"], episode["dynamics", "position"][:, t])
         td = env.step(td.set("action", episode["action"][:, t]))["next"]
+
+
+def test_a_demonstrator_plans_anew_where_it_takes_over(monkeypatch):
+    begun = []
+
+    def demonstrator(task, world):
+        begun.append(world.steps)
+        return lambda: np.zeros(3)
+
+    monkeypatch.setattr(BalanceReaching, "demonstrator", demonstrator)
+    session = Session("balance_reaching")
+    for driver in ("expert", "expert", "person", "expert", "expert"):
+        session.driver = driver
+        session.step()
+    assert begun == [0, 3]
 
 
 def test_a_policy_drives_as_in_its_evaluation(actor):

@@ -103,7 +103,7 @@ def test_a_run_of_the_first_release_is_refused(tmp_path):
 def test_metrics_round_trip(tmp_path):
     assert read_metrics(tmp_path) == []
     append_metrics(tmp_path, 1, loss=torch.tensor(0.5), count=np.int64(3))
-    append_metrics(tmp_path, 2, loss=0.25, unknown=math.nan, both=torch.tensor([1.0, 2.0]))
+    append_metrics(tmp_path, 2, loss=0.25, unknown=math.nan, endless=math.inf, both=torch.tensor([1.0, 2.0]))
     expected = [{"step": 1, "loss": 0.5, "count": 3}, {"step": 2, "loss": 0.25, "both": [1.0, 2.0]}]
     assert read_metrics(tmp_path) == expected
 

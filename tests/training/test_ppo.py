@@ -35,9 +35,9 @@ def small_groups():
 MAKE_ENV = partial(DynmapBatchedEnv, "balance_reaching", control="acceleration")
 
 
-def train(folder, settings=SETTINGS, threads=1, make_env=MAKE_ENV):
+def train(folder, settings=SETTINGS, threads=1, make_env=MAKE_ENV, width=16):
     seed_everything(settings.seed)
-    network = ExpertNetwork(get_task("balance_reaching").state_size, tuple(ACCELERATION_LIMIT), 16)
+    network = ExpertNetwork(get_task("balance_reaching").state_size, tuple(ACCELERATION_LIMIT), width)
 
     def judge(episodes):
         return {"episodes": episodes, "success": 0.0, "drop": 0.0}
@@ -120,6 +120,8 @@ def test_a_state_of_other_settings_is_refused(tmp_path):
     train(tmp_path, small)
     with pytest.raises(ValueError, match="other settings; choose another --run"):
         train(tmp_path, replace(small, iterations=2, gamma=0.5))
+    with pytest.raises(ValueError, match="network of another size; choose another --run"):
+        train(tmp_path, replace(small, iterations=2), width=8)
 
 
 def test_a_loss_that_is_not_finite_keeps_the_last_state(tmp_path, monkeypatch):

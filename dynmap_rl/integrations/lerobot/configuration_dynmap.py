@@ -12,7 +12,7 @@ from dynmap_rl.keys import DYNAMICS, FRAME_SHAPE
 from dynmap_rl.modules.checkpoints import check_policy
 from dynmap_rl.modules.supervision import parse_supervision
 from dynmap_rl.modules.world_model import ARCHITECTURES
-from dynmap_rl.utils.settings import check_at_least, check_share
+from dynmap_rl.utils.settings import check_at_least
 
 GOAL = 2  # entries of the goal, x and y
 
@@ -97,9 +97,8 @@ class DynmapConfig(PreTrainedConfig):
             )
         check_at_least(self, 2, "window_steps")
         check_at_least(self, 1, "latent_size", "hidden_size", "rgb_frames")
-        check_at_least(self, 0, "width", "beta_z", "beta_dynamics", "beta_joint", "emphasis")
+        check_at_least(self, 0, "width", "beta_z", "beta_dynamics", "beta_joint", "emphasis", "rarity")
         check_at_least(self, 0, "optimizer_lr", "optimizer_weight_decay")
-        check_share(self, "rarity")
         if not supervision and self.beta_dynamics != 1.0:
             raise ValueError("--policy.beta_dynamics has no effect with supervision none; leave it out")
         if not 0 <= self.delay < self.chunk_size:
