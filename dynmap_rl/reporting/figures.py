@@ -97,7 +97,11 @@ def plot_prediction(world_model: WorldModel, episodes: TensorDictBase, path: Pat
 
 
 def plot_perception(
-    world_models: dict[str, WorldModel], episodes: TensorDictBase, path: Path, steps=(2, 20)
+    world_models: dict[str, WorldModel],
+    episodes: TensorDictBase,
+    path: Path,
+    steps=(2, 20),
+    dt: float = CONTROL_DT,
 ) -> None:
     """Draw frames of episodes ``[E, T]`` and, below, what each world model predicted from the frame before.
 
@@ -106,6 +110,7 @@ def plot_perception(
         episodes: one column each.
         path: file to write.
         steps: time steps, from the top.
+        dt: control step (s).
     """
     rows = {"frame": episodes["pixels"] / 255}
     rows |= {
@@ -116,7 +121,7 @@ def plot_perception(
         *shape, figsize=(1.1 * shape[1] + 1.5, 1.1 * shape[0]), squeeze=False, layout="constrained"
     )
     shown = [
-        (f"frame, {t * CONTROL_DT:.2f} s" if name == "frame" else name, frames[:, t])
+        (f"frame, {t * dt:.2f} s" if name == "frame" else name, frames[:, t])
         for t in steps
         for name, frames in rows.items()
     ]

@@ -81,6 +81,12 @@ def test_policies_are_trained_and_judged(recorded):
     assert actor.world_model.encode(torch.zeros(1, 3, 96, 192, dtype=torch.uint8)).shape == (1, 64)
     judged = run(folder, "evaluate", "--policy", path, "--eval.episodes", "2")
     assert judged.returncode == 0 and "SR" in judged.stdout
+    probed = run(folder, "probe", "--runs", path, "--task", name, "--train_episodes", "3")
+    assert probed.returncode == 0, probed.stderr
+    facts = json.loads((folder / "runs/probe/probe.json").read_text())
+    entries = len(get_task(name).layout.dynamics["velocity"])
+    assert len(facts["probes"]["RGB+[P+V], decoupled"]["hidden1"]["velocity"]) == entries
+    assert facts["verdicts"]["RGB+[P+V], decoupled"]["verdict"] in ("good", "doubtful")
 
 
 def test_the_expert_is_judged(recorded):

@@ -65,8 +65,8 @@ def test_writes_errors_and_probes_of_every_world_model(trained, recording, tmp_p
     ("arguments", "message"),
     [
         (["--runs", "nothing"], "nothing"),
-        (["--runs", "robot"], "must be of tasks 1 to 3, got robot"),
-        (["--runs", "foreign"], "must be of tasks 1 to 3, got foreign"),
+        (["--runs", "robot"], "must be of a task, got robot"),
+        (["--runs", "foreign"], "must be imported first; name it with --task"),
         (["--runs", "none", "--test_episodes", "0"], "test_episodes"),
         (["--runs", "position", "--horizon", "200"], "120, got 20 + 200"),
     ],
