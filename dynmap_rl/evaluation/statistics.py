@@ -136,6 +136,29 @@ def welch_interval(rates_a: Sequence[float], rates_b: Sequence[float]) -> tuple[
     return float(found.low), float(found.high)
 
 
+def mean_gap(pairs: Sequence[tuple[Sequence[float], Sequence[float]]]) -> tuple[float, float, float] | None:
+    """Return the mean over tasks of the difference of two means of rates, with its 95 % interval (Welch-Satterthwaite).
+
+    Args:
+        pairs: for each task the rates of both sides, in %; the second mean is subtracted.
+
+    Returns:
+        The mean and the ends, in points; None for fewer than two rates on a side, or if no side varies.
+    """
+    from scipy.stats import t
+
+    sides = [np.asarray(side, float) for pair in pairs for side in pair]
+    if not sides or min(map(len, sides)) < 2 or max(map(np.ptp, sides)) < EQUAL:
+        return None
+    gap = float(np.mean([np.mean(a) - np.mean(b) for a, b in pairs]))
+    shares = np.array([side.var(ddof=1) / len(side) for side in sides])
+    freedom = shares.sum() ** 2 / sum(
+        share**2 / (len(side) - 1) for share, side in zip(shares, sides, strict=True)
+    )
+    half = float(t.ppf(0.975, freedom)) * shares.sum() ** 0.5 / len(pairs)
+    return gap, gap - half, gap + half
+
+
 def paired_interval(rates_a: Sequence[float], rates_b: Sequence[float]) -> tuple[float, float] | None:
     """Return the 95 % interval (paired t) of the mean difference of rates, such as those of one world model each.
 

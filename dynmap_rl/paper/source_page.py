@@ -10,14 +10,12 @@ from dynmap_rl.envs.tasks import get_task
 from dynmap_rl.utils.files import read_json, write_bytes
 
 from .results import count_devices
+from .source_figures import plot_data, plot_measures, plot_sources
 from .source_results import (
     MEASURES,
     data_table,
     find_unmeasured,
     gap_table,
-    plot_data,
-    plot_measures,
-    plot_sources,
     rank_correlations,
     read_source,
     source_table,
@@ -28,6 +26,10 @@ from .tables import commits_text, devices_text, join_table, p_text
 REPEATED = (
     "The world models of these runs were trained again between their recurrent and their feed-forward policies, and only the "
     "training that was measured is in the figures of measures: {}."
+)
+SOURCES_FIGURE = (
+    "Lines in the figure are the 95 % intervals over the test scenes, and ticks the rates of the world models. Sources whose lines do "
+    "not overlap may still not differ over world models: see the table of differences."
 )
 DATA = (
     "Bands in the figure are the 95 % intervals over the test scenes, for the world models that there are: one, or as many as "
@@ -67,6 +69,7 @@ def write_source_page(results: Path, tasks: list[str], architecture: str = "glim
             [policy, MEASURES[measure][0], f"{row['rho']:.2f}", p_text(row["p"]), str(row["sources"])]
             for (policy, measure), row in correlations.items()
         ]
+        parts.append(SOURCES_FIGURE)
         plots = {"sources": plot_sources}
         plots |= {"measures": partial(plot_measures, correlations=correlations)} if rows else {}
         for name, plot in plots.items():

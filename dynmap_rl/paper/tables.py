@@ -56,6 +56,8 @@ def markdown_overview(cells: Mapping[Key, Cell]) -> str:
         for column in columns:
             paper, cell = TABLES[column].get(row), cells.get((*column, row))
             ours = f"**{cell.summary['SR']:.1f}**" if cell and cell.results else "-"
+            if cell and cell.missing and cell.results:
+                ours += f" ({len(cell.world_models)})"
             line.append(f"{paper[-1][0]} / {ours}" if paper else "")
         lines.append(line)
     names = [f"{table}: {_name(column)}" for table, columns in COLUMNS.items() for column in columns]

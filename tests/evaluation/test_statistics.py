@@ -6,6 +6,7 @@ from scipy.stats import permutation_test, t, ttest_1samp, ttest_rel
 
 from dynmap_rl.evaluation.statistics import (
     exchange_p,
+    mean_gap,
     outcome_gap,
     paired_interval,
     shared_interval,
@@ -52,6 +53,14 @@ def test_students_interval_is_that_of_scipy_within_0_and_100():
     assert student_interval(rates) == pytest.approx((expected.low, expected.high))
     assert student_interval([90.0, 100.0]) == (pytest.approx(31.5, abs=0.1), 100.0)
     assert student_interval([90.0]) is None and student_interval([90.0, 90.0, 90.0]) is None
+
+
+def test_a_mean_over_tasks_is_welchs_with_one_task_and_narrower_with_several():
+    a, b = [90.0, 95.0, 97.0], [80.0, 70.0, 60.0]
+    assert mean_gap([(a, b)]) == pytest.approx((24, *welch_interval(a, b)))
+    gap, low, high = mean_gap([(a, b)] * 3)
+    assert gap == pytest.approx(24) and high - low < (mean_gap([(a, b)])[2] - 24) * 2 / 3**0.5
+    assert mean_gap([(a, b), (a, [80.0])]) is None and mean_gap([([90.0] * 2, [80.0] * 2)]) is None
 
 
 def test_welchs_interval_is_the_textbook_one():
