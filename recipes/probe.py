@@ -95,18 +95,17 @@ def main(config: Config) -> None:
         }
         perception = measure_perception(models, task, dataset, train, test)
     verdicts = {name: judge_states(probed) for name, probed in probes.items()}
-    text = describe(open_loop, probes, perception, verdicts, seconds=0.05 * config.horizon)
+    facts = {"command": command_line(sys.argv), "commit": find_commit()}
+    facts |= {"train_episodes": len(train), "test_episodes": len(test), "open_loop": open_loop}
+    facts |= {"probes": probes, "perception": perception, "verdicts": verdicts}
+    text = describe(facts, rules.layout.dynamics["velocity"], 0.05 * config.horizon)
     print(text)
     (config.output / "open_loop.png").unlink(missing_ok=True)  # of other --runs
     if open_loop:
         plot_open_loop(open_loop, config.output / "open_loop.png")
     plot_probes(probes, config.output / "probes.png")
     plot_perception(models, test[:8], config.output / "perception.png", dt=rules.layout.dt)
-    command = command_line(sys.argv)
-    write_html(config.output, "States and predictions of world models", text, command, plain_settings(config))
-    facts = {"command": command, "commit": find_commit()}
-    facts |= {"train_episodes": len(train), "test_episodes": len(test), "open_loop": open_loop}
-    facts |= {"probes": probes, "perception": perception, "verdicts": verdicts}
+    write_html(config.output, "States of world models", text, facts["command"], plain_settings(config))
     write_json(config.output / "probe.json", facts)
     print(f"written: {config.output}")
 
@@ -166,18 +165,18 @@ def load_world_models(runs: list[str]) -> tuple[dict, str]:
     return named, next(iter(tasks))
 
 
-def describe(open_loop: dict, probes: dict, perception: dict, verdicts: dict, seconds: float) -> str:
-    """Return the results as lines of text."""
+def describe(facts: dict, entries: tuple, seconds: float) -> str:
+    """Return the results as lines of text; ``entries`` are the names of the velocities."""
     import numpy as np
 
     from dynmap_rl.evaluation.probing import judged_text
 
     lines = []
-    for name, errors in open_loop.items():
+    for name, errors in facts["open_loop"].items():
         last = {key: values[-1] for key, values in errors["model"].items()}
         distances = f"cart {last['cart_mm']:.0f} mm, block {last['block_mm']:.0f} mm"
         lines.append(f"{name}: error after {seconds:.1f} s without frames: {distances}")
-    for name, places in perception.items():
+    for name, places in facts["perception"].items():
         for where, found in places.items():
             lines.append(
                 f"{name}, {where}: colour error on objects {found['object_error']:.3f}, chroma explained "
@@ -185,12 +184,15 @@ def describe(open_loop: dict, probes: dict, perception: dict, verdicts: dict, se
                 f"{found['background_error']:.3f}, cart by a linear map "
                 f"{1000 * found['cart_error']:.1f} mm"
             )
-    for name, states in probes.items():
+    for name, states in facts["probes"].items():
         for state, quantities in states.items():
             values = "  ".join(f"{q} {np.nanmean(r2):5.2f}" for q, r2 in quantities.items())
             lines.append(f"{name}: R^2 of {state:8} {values}")
-    for name, found in verdicts.items():
-        lines.append(f"{name}: {judged_text(found)}")
+    for name, found in facts["verdicts"].items():
+        pairs = zip(entries, facts["probes"][name][found["state"]]["velocity"], strict=True)
+        lines.append(
+            f"{name}: {judged_text(found)}: " + ", ".join(f"{entry} {r2:.2f}" for entry, r2 in pairs)
+        )
     return "\n".join(lines)
 
 
